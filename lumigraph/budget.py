@@ -102,8 +102,8 @@ MEANS: Mapping[Quality, str] = {
 class Effort:
     """Training effort of a quality.
 
-    passes:   how often everything is learnt from, on average: each photograph, or each of their pixels
-    at_least: steps, however small the capture
+    passes:   mean number of uses of each photograph, or of each pixel
+    at_least: smallest number of steps, for small captures
     """
 
     passes: float

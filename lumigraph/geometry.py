@@ -155,7 +155,7 @@ class Similarity:
         return Similarity(self.matrix @ other.matrix)
 
     def points(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """The same places in the target's frame; worked out in double precision, given in the points' own."""
+        """Points transformed to the target's frame; computed in double precision, returned in the points' own."""
         matrix = self.matrix.to(points.device)
         return (points.double() @ matrix[:3, :3].T + matrix[:3, 3]).to(points.dtype)
 
@@ -203,7 +203,7 @@ def is_far(points: Float[np.ndarray, "point 3"], size: float) -> bool:
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """So many of the items at most, evenly spread, in order; the first and the last among them."""
+    """Evenly spread subset of at most `count` items, in order, with the first and the last."""
     count = min(count, len(items))
     if count == 1:
         return [items[0]]

@@ -180,7 +180,7 @@ def open_scene(
 
 
 def confirm(source: str | Path) -> None:
-    """Raise LumigraphError where there is nothing at a source that could be learnt from, by whatever method."""
+    """Raise LumigraphError if a source has no training data for any method."""
     if (request := requested(source)) is not None:
         synthetic.confirm(request)
         return

@@ -39,7 +39,7 @@ def composite(
 
 
 def weights_of(samples: Samples, density: Float[Tensor, " sample"], stop: float = 0.0) -> Float[Tensor, " sample"]:
-    """Each sample's share of what the eye gets, T_i (1 - exp(-sigma_i delta_i)); see `composite`."""
+    """Weights of samples, T_i (1 - exp(-sigma_i delta_i)); see `composite`."""
     tau = density * samples.length
     return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2]
 
@@ -51,10 +51,10 @@ FIRST_STRETCH = 8  # samples per ray in the first query; each further query has 
 def visible_weights(
     samples: Samples, thickness_of: Callable[[Int[Tensor, " asked"]], Float[Tensor, " asked"]], stop: float
 ) -> Float[Tensor, " sample"]:
-    """Weights of samples, 0 where no light comes, with few queries: front to back, a stretch of each ray at a time.
+    """Weights of samples, 0 beyond termination, with few queries: front to back, a part of each ray at a time.
 
     thickness_of: optical thickness of the samples of these numbers
-    stop:         transmittance below which a ray is spent, as in `composite`
+    stop:         transmittance below which a ray terminates, as in `composite`
     """
     begin, end = samples.ray_starts[:-1], samples.ray_starts[1:]
     light, tau = torch.ones(len(begin), device=begin.device), torch.zeros_like(samples.t_start)

@@ -53,7 +53,7 @@ class SceneView:
 
 
 class SceneViews:
-    """Viewers by the path of what they show."""
+    """Viewers by the path of their scene."""
 
     def __init__(self, folder: Path, program: Sequence[str] = REQUESTED):
         self.folder, self.program = folder, list(program)

@@ -62,8 +62,8 @@ class AppCommand:
 
 @contextlib.contextmanager
 def door(address: Any) -> Iterator[str]:
-    """Address that a browser is given. One with a token, which other users would see among the browser's arguments, is
-    in a page of this user alone that leads there."""
+    """Address for the browser's command line. An address with a token, which other users could see among the arguments,
+    is replaced by a local page, readable by this user alone, that redirects to it."""
     if not address.token:
         yield address.url
         return

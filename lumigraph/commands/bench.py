@@ -166,7 +166,7 @@ def budgets(seconds: Sequence[float], steps: Sequence[int]) -> list[Budget]:
 
 
 def place_of(scene: str) -> str:
-    """Source with poses for a scene that a user names, independent of the current folder: paths become absolute."""
+    """Source with poses of a named scene, independent of the current folder: paths become absolute."""
     source = posed(scene)
     path = Path(source).expanduser()
     return str(path.resolve()) if path.exists() else source
@@ -245,8 +245,8 @@ class BenchViews(Cells):
     def by_priors(
         self, names: Sequence[str], sources: Sequence[str], budget: Budget
     ) -> tuple[dict[str, dict[int, Path]], list[Cell]]:
-        """The prior's run for each method that learns from collections and each seed, and cells that train those that
-        are not there."""
+        """The prior's run for each method that learns from collections and each seed, and cells that train missing
+        ones."""
         from ..datasets.collection import Collection
         from ..lab.benchmark.cell import Cell
         from ..opening import kind_of
@@ -310,7 +310,7 @@ class BenchViews(Cells):
         return len(open_scene(source, downscale=downscale, reader=self.reader).splits["train"])
 
     def possible(self, source: str, there: int) -> list[int | None]:
-        """The numbers of views that a scene has photographs for; `None` is all."""
+        """Numbers of views up to a scene's number of photographs; `None` is all."""
         left_out = [views for views in self.views if views != "all" and views > there]
         if left_out:
             say(f"{source} has {there} photographs to learn from; leaving out {', '.join(map(str, left_out))}")
@@ -379,7 +379,7 @@ class BenchShapes:
 
 
 def learns_one(name: str) -> bool:
-    """True if a method of shapes learns a single one."""
+    """True if a method of shapes trains on a single one."""
     from ..components.sampling.coded_surface import CodedSurface
 
     return not issubclass(methods.find(name), CodedSurface)

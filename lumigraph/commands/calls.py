@@ -45,7 +45,7 @@ def command(name: str, /, *arguments: object, **options: Any) -> Any:
 
 
 def by_name(name: str, arguments: tuple[object, ...], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Positional arguments by the names of their fields; a field of several values takes all that are left."""
+    """Positional arguments by the names of their fields; a field of several values takes all the rest."""
     places = [
         (field, kind)
         for field, kind in hints(kind_of(Request(name))).items()
@@ -61,9 +61,9 @@ def by_name(name: str, arguments: tuple[object, ...], options: Mapping[str, Any]
 
 
 def filled(kind: Any, options: dict[str, Any], where: str, default: Any = None) -> Any:
-    """A dataclass, and dataclasses that it holds, of options by name, which are taken out of `options`.
+    """A dataclass, with nested dataclasses, from options by name, which are removed from `options`.
 
-    default: value to begin with, in place of the defaults of the fields
+    default: initial value, instead of the defaults of the fields
     """
     given = dict[str, Any]()
     for field in fields(kind):

@@ -76,7 +76,7 @@ def show_masks(folder: Path, onward: str) -> None:
 
 
 def posed(scene: str) -> str:
-    """The scene itself, or for bare photographs and videos the folder with their poses, which are found first."""
+    """The scene itself; bare photographs and videos become a folder with poses, by capture."""
     from ..opening import PROCEDURAL
     from ..sfm.photos import is_bare
 
@@ -90,7 +90,7 @@ def posed(scene: str) -> str:
 
 
 def scene_folder(what: tuple[Path, ...]) -> Path:
-    """scenes/NAME, called after the folder or the video, or for a list of files after the folder that all are in."""
+    """scenes/NAME, named after the folder or the video, or for a list of files after their common folder."""
     first = what[0].expanduser().resolve()
     if len(what) > 1 or first.suffix.lower() in (".jpg", ".jpeg", ".png"):
         first = Path(os.path.commonpath([path.expanduser().resolve().parent for path in what]))

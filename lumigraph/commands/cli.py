@@ -90,7 +90,7 @@ def with_range(kind: Any, name: str = "") -> Any:
 
 
 def held(command: Any) -> Any:
-    """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
+    """Validate a parsed command. Raises LumigraphError for a number out of range, and for contradictory ones."""
     for name, kind, value in outside(command):
         called = option_name(name, kind).replace("_", "-")
         typed = " ".join(map(format_value, value)) if isinstance(value, tuple) else format_value(value)

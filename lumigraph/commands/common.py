@@ -55,14 +55,14 @@ def default_config(command: type, kind: Any, device: Any) -> Any:
 
 
 def preset_device(device: str, preset: str) -> Any:
-    """The kind of machine for the defaults of a method; this machine need not have it."""
+    """Kind of machine for a method's default parameters, which need not be this one."""
     import torch
 
     return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
 
 
 def value_of(name: str, arguments: Sequence[str], default: str) -> str:
-    """The value of an option, before all options are known."""
+    """The value of an option, before full parsing."""
     for i, argument in enumerate(arguments):
         if argument.startswith(f"{name}="):
             return argument.partition("=")[2]
@@ -87,7 +87,7 @@ def say(text: str) -> None:
 
 @contextlib.contextmanager
 def kept_rows() -> Iterator[dict[str, Any]]:
-    """A block whose `show` prints nothing; the dictionary has its rows."""
+    """A block in which `show` prints nothing; the dictionary receives its rows."""
     rows: dict[str, Any] = {}
     token = _kept.set(rows)
     try:

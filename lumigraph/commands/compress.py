@@ -73,7 +73,7 @@ def verdict(made: Any, run: Path) -> str:
 
 
 def table(made: Any) -> Any:
-    """Before and after."""
+    """Table of figures before and after."""
     from rich.table import Table
 
     rows = Table("", "before", "after", "")

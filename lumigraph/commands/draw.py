@@ -147,13 +147,13 @@ def numbers(text: str) -> list[int]:
 
 
 def magnified(picture: Any) -> Any:
-    """A picture with whole pixels enlarged, where it is too small to be looked at."""
+    """A picture with whole pixels enlarged, if it is small."""
     times = -(-MIN_CELL // picture.shape[0])
     return picture.cpu().repeat_interleave(times, 0).repeat_interleave(times, 1)
 
 
 def turned(camera: Any, count: int, turns: int = 1) -> Any:
-    """A camera at so many angles around the vertical axis through the scene's origin, so many times around."""
+    """Cameras at equal angles around the vertical axis through the scene's origin. turns: number of revolutions"""
     import torch
 
     from ..camera import Camera

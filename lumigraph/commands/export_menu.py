@@ -64,7 +64,7 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
 
 
 def options_of(kind: type) -> Iterator[Any]:
-    """The options of an export's command that the viewer offers, those of dataclasses that it holds among them."""
+    """Options of an export's command in the viewer, including those of nested dataclasses."""
     from ..viewer.shared import ExportOption
 
     said = hints(kind)
@@ -107,7 +107,7 @@ def typed_option(name: str, value: str | bool, default: str | bool) -> list[str]
 
 
 def run_export(command: list[str], report: Callable[[str], None]) -> str:
-    """Run a command line in a process of its own, so that the viewer goes on; returns what it prints.
+    """Run a command line in a separate process, without blocking the viewer; returns its output.
 
     report: called with each line of progress
     Raises LumigraphError with its last line if it fails.

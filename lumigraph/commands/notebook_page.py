@@ -1,4 +1,4 @@
-"""A run in a notebook: a small page to turn, made in seconds, above a still for front ends that show no frames."""
+"""A run in a notebook: a small interactive page, rendered in seconds, above a still for front ends without frames."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def shown(opened: Opened) -> str:
 
 
 def small_page(opened: Opened) -> str | None:
-    """Page of splats, or of as many views as are rendered in MAX_SECONDS; None where it is larger or takes longer."""
+    """Page of splats, or of as many views as are rendered in MAX_SECONDS; None if it is too large or too slow."""
     options: dict[str, Any] = {"kind": "splats"}
     if not can(opened.ready(), HasGaussians):
         opened.still(VIEW_PIXELS)  # compiles kernels

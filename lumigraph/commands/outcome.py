@@ -119,9 +119,9 @@ def examined(run: Any, method: Method, data: Any, turn: Any) -> Examined:
 
 
 def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str:
-    """Advice in one sentence for a run that renders held-out photographs worse: priors that were on, what to do next.
+    """Advice in one sentence for a run with worse held-out than training photographs: active priors and the next step.
 
-    gap:   dB by which training photographs are better
+    gap:   PSNR of training photographs minus that of held-out ones, dB
     worst: names of held-out photographs, lowest PSNR first
     """
     from ..sfm.doctor import label
@@ -174,12 +174,12 @@ def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
 
 
 def photographed(run: Any, data: Any) -> bool:
-    """True if a run learnt from photographs of a place, to which some could be added."""
+    """True if a run was trained on photographs of a place, to which some could be added."""
     return run.photographed and len(data.splits["train"]) > 1 and not data.source.startswith("procedural:")
 
 
 def more_time(folder: Any, budget: Budget) -> str:
-    """The command that goes on with a finished run, by the next larger budget of its kind."""
+    """Command that extends a finished run, by the next larger budget of its kind."""
     longer: list[str]
     if budget.quality in QUALITIES[:-1]:
         longer = ["--quality", QUALITIES[QUALITIES.index(budget.quality) + 1]]

@@ -34,7 +34,7 @@ class Resume(ViewerOptions, ResumeOptions):
             return self._go_on(run)
 
     def _go_on_in_blocks(self, folder: Path) -> int:
-        """Train the blocks that are not done, as the run's own plan says, one after another in this process."""
+        """Train the unfinished blocks by the run's own plan, one after another in this process."""
         from ..large.plan import PLAN_FILE, Plan
         from ..large.planning import begin
         from ..large.training import Workers

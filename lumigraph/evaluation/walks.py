@@ -101,7 +101,7 @@ def evaluate_walk(
     options: EvaluationOptions = EvaluationOptions(),
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
 ) -> WalkEvaluation:
-    """Render the cameras of a split, which lie along a walk, and compare each frame with the one before.
+    """Render the cameras of a split, which lie along a walk, and compare each frame with the previous one.
 
     keep: receives each frame's name and rendering
     options: of which the views are the first frames

@@ -165,7 +165,7 @@ def swapped(one: Path, other: Path) -> bool:
 
 
 def place_now(path: Path, ask: Callable[[], None]) -> Path:
-    """Destination of a finished output: the requested path, or one beside it if it has been taken meanwhile."""
+    """Destination of a finished output: the requested path, or one next to it if it has been taken meanwhile."""
     try:
         ask()
         return path

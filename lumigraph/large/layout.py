@@ -171,7 +171,7 @@ def cells(
 
 
 def members(places: Places, disc: Disc) -> Bool[np.ndarray, " photograph"]:
-    """Mask of the photographs of a block: those taken within its radius, and those from near by that look at it."""
+    """Mask of the photographs of a block: those within its radius, and nearby ones that look at it."""
     way = np.array(disc.centre) - places.positions
     flat = np.linalg.norm((way @ places.upright.T)[:, :2], axis=-1)
     towards = (way * places.forwards).sum(-1) > FACING_COSINE * np.linalg.norm(way, axis=-1)

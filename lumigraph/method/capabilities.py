@@ -72,7 +72,7 @@ class HasLevels(Protocol):
     levels: int
 
     def level_bytes(self, level: int) -> int:
-        """Bytes of what a level needs."""
+        """Bytes of a level."""
 
 
 class HasGaussians(Protocol):

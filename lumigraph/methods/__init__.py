@@ -111,8 +111,8 @@ def loaded_files() -> dict[str, str]:
 
 
 def known_again(name: str, file: str | None) -> bool:
-    """True if a run's method is available, once the file that it came from is loaded. A file runs only as this user has
-    loaded it before: a run that came from elsewhere runs nothing."""
+    """True if a run's method is available, once its file is loaded. A file runs only if this user has loaded the same
+    contents before: a run from elsewhere executes nothing."""
     if name in available():
         return True
     if file is None or not files.is_file(file):
@@ -189,7 +189,7 @@ def find(name: str) -> type[Any]:
 
 
 def learning_from(dataset: type[Any]) -> list[str]:
-    """The names of the installed methods that learn from a kind of dataset."""
+    """Names of the installed methods that train on a kind of dataset."""
     return [name for name in available() if issubclass(dataset, find(name).learns_from)]
 
 

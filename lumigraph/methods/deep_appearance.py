@@ -64,8 +64,8 @@ class Unwrapped:
     """Photographs as textures.
 
     rgb:    bytes; 0 where `shown` is False
-    shown:  texels that the photograph shows
-    view:   unit direction from the mesh's middle to the camera
+    shown:  mask of texels visible in the photograph
+    view:   unit direction from the mesh's centre to the camera
     moment: number of the expression
     """
 
@@ -187,7 +187,7 @@ class DeepAppearance(Method):
     # Learning
 
     def compile_begin(self) -> None:
-        """On the copy that rehearses a step: one empty photograph in place of what `begin` unwraps."""
+        """For kernel compilation on a copy: one empty photograph instead of the textures of `begin`."""
         super().compile_begin()
         self.meshes.rows = self.mean_mesh[None]
         self.textures.rows = self.mean_texture.byte()[None]

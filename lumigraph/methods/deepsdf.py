@@ -109,8 +109,8 @@ class Decoder(SkipNetwork):
 
 
 class DeepSDF(CodedSurface):
-    """Learns a code for each shape of Shapes, and the distance that a code means; `given` another shape, or a scan of
-    some sides of it, it finds the code that agrees best."""
+    """Learns a code for each shape of Shapes and a decoder of codes to signed distance; `given` a new shape, or a
+    partial scan of it, it fits the code."""
 
     Config = Config
     taken_kinds = ("mesh", "half scan")
@@ -192,8 +192,8 @@ class DeepSDF(CodedSurface):
     # A new shape
 
     def _observed(self, shape: Shape) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Points and their distance to the surface, as far as a new shape says. Raises LumigraphError for points
-        without normals."""
+        """Samples of points and their signed distance from a new shape. Raises LumigraphError for points without
+        normals."""
         generator = self.random(2)
         if not shape.is_cloud:
             numbers = replace(self.config.points, pool_points=OBSERVED_POINTS)
@@ -236,7 +236,7 @@ class DeepSDF(CodedSurface):
         return code
 
     def _start(self, shape: Shape, error: Any) -> Float[Tensor, " unknown"]:
-        """The learnt code, or the average, and the place of a scan that agree best with a new shape."""
+        """Initial code, learnt or average, and pose of a scan with the smallest error on a new shape."""
         known = self.codes.rows.detach()[self.codes.learnt]
         most = MAX_PLACED_CANDIDATES if shape.partial else MAX_CANDIDATES
         some = torch.randperm(len(known), generator=self.random(4))[:most]
@@ -252,5 +252,5 @@ class DeepSDF(CodedSurface):
 
 
 def placed(place: Float[Tensor, " 4"]) -> tuple[Tensor, Tensor]:
-    """Scale and shift of a scan into the whole, from the numbers that a fit changes."""
+    """Scale and shift from a scan to the whole shape, from the optimised parameters."""
     return (PLACE_STEP * place[3]).exp(), PLACE_STEP * place[:3]

@@ -49,7 +49,7 @@ class Config:
 
 
 class DreamFields(FieldMethod):
-    """A hash table in a box, whose random views are led to a prompt."""
+    """A hash table in a box, optimised so that random views match a prompt."""
 
     Config, further_bytes, learns_from = Config, staticmethod(sampling_bytes), Words
     efforts: ClassVar[Efforts] = {"draft": Effort(1, 300), "good": Effort(1, 2000), "best": Effort(1, 10_000)}

@@ -47,7 +47,7 @@ class Config:
 
 
 class DreamSplats(Method):
-    """Gaussians in a ball, whose random views are led to a prompt. Their number is constant."""
+    """Gaussians in a ball, optimised so that random views match a prompt. Their number is constant."""
 
     Config, learns_from = Config, Words
     efforts: ClassVar[Efforts] = {"draft": Effort(1, 300), "good": Effort(1, 2000), "best": Effort(1, 10_000)}

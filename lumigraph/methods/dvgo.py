@@ -158,7 +158,7 @@ class VoxelField(Field):
 
 
 class DVGO(FieldMethod):
-    """A coarse stage finds where things are, a fine one within their tight box shows what they look like."""
+    """A coarse stage finds the occupied box, a fine one within it learns appearance."""
 
     Config = Config
     network: VoxelField
@@ -270,8 +270,8 @@ class DVGO(FieldMethod):
 
     @torch.no_grad()
     def _enter_fine(self, voxels: int) -> None:
-        """Shrink to the box around all that is dense, where there is a bound. What was found stays as dense as it was;
-        what is thinner than free space at the beginning of the fine stage begins as that does."""
+        """Shrink to the bounding box of dense cells, in bounded scenes. Coarse densities are kept; densities below the
+        fine stage's initial free space are raised to it."""
         c, network, grid = self.config, self.network, self.network.density_grid
         thickness = nn.functional.softplus(grid.values[:, 0] + network.shift(0))
         dense = 1 - torch.exp(-thickness) > BOX_ALPHA
@@ -291,8 +291,8 @@ class DVGO(FieldMethod):
 
     @torch.no_grad()
     def _view_share(self, scene: Scene) -> Float[Tensor, " corner"]:
-        """Photographs that see each corner, as a share of the most: rates of the coarse stage, so that space before one
-        camera alone does not grow dense first (section 4.1)."""
+        """Number of photographs that see each corner, as a share of the largest: learning rates of the coarse stage, so
+        that space seen by one camera alone does not become dense first (section 4.1)."""
         n = VIEW_CELLS
         counts = torch.zeros(n**3, device=self.device)
         box = self.network.density_grid.box
@@ -316,8 +316,8 @@ class DVGO(FieldMethod):
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Density and colour of the teacher at the fine grid's corners, where it holds something; its first three
-        features are colour, and the network adds nothing at first."""
+        """Density and colour of the teacher at occupied corners of the fine grid; its first three features are colour,
+        and the network adds nothing at first."""
         known, c, chance, network = teacher_of(teacher, cameras), self.config, self.random(3), self.network
         space, n = network.space, c.occupancy
         occupied = known.occupied(space, n.occupancy_resolution, n.occupancy_threshold, chance)

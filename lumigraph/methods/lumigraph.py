@@ -137,7 +137,7 @@ class Lumigraph(ImageBasedMethod):
         return Rendering(rgb, depth, opacity).reshape(height, width)
 
     def _nothing(self, camera: Camera) -> Rendering:
-        """The background, while no photographs are known."""
+        """The background, for a method without photographs."""
         height, width = shape(camera)
         empty = torch.zeros(height, width, device=self.device)
         return Rendering(self.background.expand(height, width, 3).clone(), empty + torch.inf, empty)

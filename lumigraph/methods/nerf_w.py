@@ -36,7 +36,7 @@ THIN = 3.0  # transient density is exp(-THIN) per scene unit at first, beside a 
 
 @dataclass(frozen=True)
 class Transient:
-    """Density per scene unit and colour of what one photograph alone saw, and the deviation of its colour."""
+    """Density per scene unit, colour and colour deviation of a photograph's transient objects."""
 
     density: Float[Tensor, " sample"]
     rgb: Float[Tensor, "sample 3"]
@@ -67,8 +67,8 @@ class TransientHead(nn.Module):
 
 
 class HashTransientHead(nn.Module):
-    """The same from the encoding of an `EncodedHashField`. One photograph alone sees a passer-by and cannot tell how
-    far away they stood, so transient density is learnt where its rays are sampled anyway: at the surfaces behind."""
+    """The same from the encoding of an `EncodedHashField`. One photograph alone does not determine a transient's
+    distance, so transient density is learnt at the static field's samples: at the surfaces behind."""
 
     def __init__(self, *widths: int):
         super().__init__()

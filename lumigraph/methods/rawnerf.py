@@ -126,7 +126,7 @@ class RawNeRF(FieldMethod):
     # What there is to learn from
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """Take what the photographs say of exposure and colour, and how much light there is in all."""
+        """Set exposure and colour from the photographs, and the mean light."""
         super().begin(data, seconds)
         scene, train = data, data.splits["train"]
         if "mosaic" not in scene.layers and "raw" not in scene.layers:
@@ -156,7 +156,7 @@ class RawNeRF(FieldMethod):
         self.brightness.copy_(self.brightness_of(scene, light[measured[:, 1] & (taken == 1), 1]))
 
     def brightness_of(self, scene: Scene, green: Float[Tensor, " pixel"]) -> Float[Tensor, ""]:
-        """Factor on linear light in development: that of the photographs, else one that leaves little beyond white.
+        """Factor on linear light in development: that of the photographs, else one that clips few pixels.
 
         green: light of some pixels in the longest exposure
         """
@@ -171,7 +171,7 @@ class RawNeRF(FieldMethod):
         return data.sample_rays(self.sampler.batch_size, generator, layers=layers_of(data)).to(self.device)
 
     def measured(self, batch: Batch) -> tuple[Float[Tensor, "ray 3"], Bool[Tensor, "ray 3"]]:
-        """The light of a batch's pixels as it was exposed, and which of its colours were measured."""
+        """Exposed light of a batch's pixels, and a mask of measured colours."""
         if "mosaic" in batch.extra:
             light = batch.extra["mosaic"][:, None].expand(-1, 3)
             behind = batch.extra["filter"][:, None] == torch.arange(3, device=light.device)
@@ -185,7 +185,7 @@ class RawNeRF(FieldMethod):
     # Learning
 
     def light(self, rays: Rays) -> Rendering:
-        """Linear light along rays in the camera's colours, before nothing."""
+        """Linear light along rays in the camera's colours, before black."""
         (samples,) = self.sampler.sample(rays, self.network)
         look = samples.look(self.network)
         return composite(look.samples, look.density, look.rgb)
@@ -211,7 +211,7 @@ class RawNeRF(FieldMethod):
         return light * self.scale(batch.rays)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
+        """The squared error relative to the rendering (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
         measured, known = self.measured(batch)
         (samples,), terms = self.learn(batch.rays, self.random(step))
         seen = self.light_and_spread(samples.look(self.network))
@@ -223,8 +223,8 @@ class RawNeRF(FieldMethod):
         return {"relative": self.penalized(error[known]), "variance": VARIANCE_WEIGHT * variance, **terms}
 
     def penalized(self, error: Float[Tensor, " value"]) -> Float[Tensor, ""]:
-        """The mean square of relative errors; beyond a delta the tangent of the square, so that what is dark by mistake
-        does not outweigh all else. Noise is far below."""
+        """The mean square of relative errors; beyond a delta the tangent of the square, so that wrongly dark pixels do
+        not dominate. Noise is far below."""
         if not (delta := self.config.huber_delta):
             return error.square().mean()
         return 2 * nn.functional.huber_loss(error, torch.zeros_like(error), delta=delta)
@@ -266,12 +266,12 @@ class RawNeRF(FieldMethod):
         return self.developed(blurred, self.background).reshape(height, width)
 
     def chunked(self, rays: Rays) -> Rendering:
-        """The light along any number of rays."""
+        """Light along any number of rays, in chunks."""
         parts = [slice(i, i + self.rays_per_chunk) for i in range(0, len(rays), self.rays_per_chunk)]
         return Rendering.cat([self.light(rays[part]) for part in parts])
 
     def distance_ahead(self, camera: Camera) -> float:
-        """Distance along the optical axis of the surface in the middle of a camera's picture."""
+        """Depth along the optical axis of the surface at the centre of a camera's picture."""
         depth = float(self.light(camera.rays(camera.size[:1] / 2).to(self.device)).depth[0])
         return depth if math.isfinite(depth) else self.frame.reach
 
@@ -279,7 +279,7 @@ class RawNeRF(FieldMethod):
         return self.developed(self.light(rays), background)
 
     def developed(self, seen: Rendering, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """Light as the picture that the controls ask for; `radiance` holds what of it was not encoded, linear sRGB."""
+        """Light developed by the controls; `radiance` holds the unencoded part, linear sRGB."""
         light = self.linear(seen.rgb) + (1 - seen.opacity)[:, None] * decoded(background)
         rgb = toned(light, str(self.control("tone")))
         return Rendering(rgb, seen.depth, seen.opacity, {"radiance": light})

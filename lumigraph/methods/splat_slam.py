@@ -82,8 +82,9 @@ class Config:
 
 
 class SplatSlam(Method):
-    """One step is one frame: find its pose by descents through the Gaussians, add Gaussians where it sees something
-    new, then descend on all of them. Gaussians are balls of one colour. Steps after the last frame map on.
+    """One step is one frame: estimate its pose by gradient descent through the Gaussians, add Gaussians in newly seen
+    regions, then optimise all of them. Gaussians are isotropic with one colour. Steps after the last frame continue
+    mapping.
 
     radius: of the scene, scene units; 0 before the first frame
     anchor: image at which each Gaussian was added
@@ -179,7 +180,8 @@ class SplatSlam(Method):
 
     def seen(self, cloud: Gaussians, frame: DepthFrame, pose: Pose) -> Splatted:
         """Colour, depth in scene units along the axis, and silhouette of the map from a pose, differentiable in both:
-        balls without view dependence move into the camera's frame by their centres alone (eqs. 2 to 5)."""
+        isotropic Gaussians without view dependence transform into the camera's frame by their centres alone (eqs. 2 to
+        5)."""
         there = replace(cloud, means=(cloud.means - pose[:, 3]) @ pose[:, :3])
         return splat(there, view_of(frame.camera, self.near_plane), 1)
 
@@ -192,7 +194,7 @@ class SplatSlam(Method):
 
     @torch.no_grad()
     def explained(self, frame: DepthFrame, pose: Pose) -> float:
-        """Share of measured pixels whose depth the map explains."""
+        """Share of measured pixels with depth explained by the map."""
         depth, known = axial(frame)
         seen = self.seen(self.gaussians(), frame, pose)
         right = (seen.opacity > NEW_SILHOUETTE) & ((surface_depth(seen) - depth).abs() < DEPTH_TOLERANCE * depth)
@@ -255,7 +257,7 @@ class SplatSlam(Method):
 
     @torch.no_grad()
     def densify(self, frame: DepthFrame, first: bool) -> None:
-        """Add a ball at each measured pixel of a mask, as large as a pixel there: r = D / f (section 3.3).
+        """Add a Gaussian at each measured pixel of a mask, with the radius of a pixel there: r = D / f (section 3.3).
 
         M = (S < 0.5) + (D < D^) (|D - D^| > 50 median |D - D^|)                                         (eq. 9)
         """
@@ -291,7 +293,7 @@ class SplatSlam(Method):
 
     @torch.no_grad()
     def carry(self, before: Float[Tensor, "image 3 4"]) -> None:
-        """Move each Gaussian with the frame at which it was added. before: poses of all images until now"""
+        """Move each Gaussian with the frame at which it was added. before: previous poses of all images"""
         old, new = before[self.anchor], self.tracker.trajectory.poses[self.anchor]
         local = torch.einsum("nji,nj->ni", old[:, :, :3], self.cloud.means - old[:, :, 3])
         self.cloud.means.copy_(torch.einsum("nij,nj->ni", new[:, :, :3], local) + new[:, :, 3])
@@ -357,7 +359,7 @@ class SplatSlam(Method):
             self.prune(keep)
 
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
-        """Leave the Gaussians of a mask."""
+        """Keep only the Gaussians of a mask."""
         self.cloud.prune(keep)
         self.anchor = self.anchor[keep]
 
@@ -378,7 +380,7 @@ class SplatSlam(Method):
 
 
 def axial(frame: DepthFrame) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Measured depth along the axis, 0 where there is none, and where there is some."""
+    """Measured depth along the axis, 0 for none, and a mask of measured pixels."""
     width, height = frame.size
     known = frame.measured & (frame.depth > 0)
     depth = torch.where(known, frame.depth * frame.rays.directions[:, 2], 0.0)
@@ -386,14 +388,14 @@ def axial(frame: DepthFrame) -> tuple[Float[Tensor, "height width"], Bool[Tensor
 
 
 def surface_depth(seen: Splatted) -> Float[Tensor, "height width"]:
-    """Mean depth of what a pixel shows: rendered depth over the silhouette, which stays a little below 1."""
+    """Mean depth of a pixel's surface: rendered depth over the silhouette, which stays a little below 1."""
     return seen.depth / seen.opacity.clamp_min(1e-3)
 
 
 def surface_of(
     frame: DepthFrame, seen: Splatted, sure: float
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
-    """Points and normals of a rendered surface in the camera's frame, and where both are known."""
+    """Points and normals of a rendered surface in the camera's frame, and a mask of pixels with both."""
     width, height = frame.size
     rays = frame.rays.directions.view(height, width, 3)
     points = rays * (surface_depth(seen) / rays[..., 2])[..., None]

@@ -91,14 +91,14 @@ class TSDFFusion(RayMethod):
 
     @property
     def complete(self) -> bool:
-        """True after the last depth map."""
+        """True after all depth maps are fused."""
         return int(self.fused) == int(self.count)
 
     def steps_per_pass(self, data: Any) -> float:
         return len(data.splits["train"])
 
     def steps_for(self, quality: Any, data: Any) -> int:
-        """Each depth map once."""
+        """One step for each depth map."""
         return len(data.splits["train"])
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:

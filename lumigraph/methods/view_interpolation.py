@@ -43,7 +43,7 @@ class Config:
 
 
 class ViewInterpolation(ImageBasedMethod):
-    """Photographs and their depth, or the flow between neighbours; a picture is made of the nearest ones."""
+    """Photographs with depth, or flow between neighbours; a picture blends the nearest ones."""
 
     Config = Config
 
@@ -80,7 +80,7 @@ class ViewInterpolation(ImageBasedMethod):
         return self._by_flow(camera) if self.config.by == "flow" else self._by_depth(camera)
 
     def _by_depth(self, camera: Camera) -> Rendering:
-        """Photographs warped by their depth, then blended where they show one surface, the nearest."""
+        """Photographs warped by their depth, then blended if they show the same, nearest surface."""
         c, tables = self.config, self.views.tables
         chosen = tables.nearest(camera, c.warped_views)
         layers = [self._splatted(i, camera) for i in chosen]
@@ -117,7 +117,7 @@ class ViewInterpolation(ImageBasedMethod):
         return found[..., 1:], found[..., 0], cover
 
     def _closed(self, rgb: Tensor, away: Tensor, seen: Tensor) -> Rendering:
-        """Fill holes with what is around them, the background first; an object's surroundings stay empty."""
+        """Fill holes from their surroundings, the background first; an object's surroundings stay empty."""
         if rgb.shape[-1] > 3:
             opacity, rgb = (
                 torch.where(seen, rgb[..., 3], 0),
@@ -130,8 +130,8 @@ class ViewInterpolation(ImageBasedMethod):
         return Rendering(filled[..., :3].clamp(0, 1), filled[..., 3], torch.ones_like(away))
 
     def _by_flow(self, camera: Camera) -> Rendering:
-        """Two photographs warped along their flow to the place between them that is nearest to the camera, then turned
-        by the homography of the plane at infinity."""
+        """Two photographs warped along their flow to the position between them nearest to the camera, then rotated by
+        the homography of the plane at infinity."""
         tables = self.views.tables
         i, j, share = self._pair(camera)
         first, second = tables.cameras[i], tables.cameras[j]
@@ -157,7 +157,7 @@ class ViewInterpolation(ImageBasedMethod):
         return Rendering(rgb, depth, torch.ones_like(depth))
 
     def _pair(self, camera: Camera) -> tuple[int, int, float]:
-        """Two photographs between which the camera is, nearly, and its share of the way from the first."""
+        """Two photographs nearly on either side of the camera, and its share of the way from the first."""
         tables = self.views.tables
         near = tables.nearest(camera, 8)
         best = (math.inf, near[0], near[0], 0.0)
@@ -173,7 +173,7 @@ class ViewInterpolation(ImageBasedMethod):
         return best[1], best[2], best[3]
 
     def _flow(self, i: int, j: int) -> Float[Tensor, "pixel 2"]:
-        """Dense flow from one photograph to another, kept once found."""
+        """Dense flow from one photograph to another, cached."""
         if (i, j) not in self._flows:
             tables = self.views.tables
             (width, height) = tables.sizes[i, :2].tolist()
@@ -184,7 +184,7 @@ class ViewInterpolation(ImageBasedMethod):
 
 
 def enlarged(values: Float[Tensor, "rows columns"], size: tuple[int, int]) -> Float[Tensor, "height width"]:
-    """Inverse depth between pixels of a depth map; across edges that of the nearest pixel."""
+    """Inverse depth, resized bilinearly; across edges that of the nearest pixel."""
     smooth = interpolate(values[None, None], size, mode="bilinear")[0, 0]
     nearest = interpolate(values[None, None], size, mode="nearest-exact")[0, 0]
     return torch.where((smooth - nearest).abs() < 0.02 * nearest, smooth, nearest)

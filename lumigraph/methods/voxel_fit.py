@@ -57,11 +57,11 @@ CLEAR = 3.0  # logits beyond which a voxel is as good as full, or empty
 
 
 class SoftVoxels(Field):
-    """A grid of logits: how much light a voxel stops, and its colour from everywhere.
+    """A grid of logits: opacity and view-independent colour of each voxel.
 
         alpha = sigmoid(v_0)      density = -log(1 - alpha) / edge = softplus(v_0) / edge      rgb = sigmoid(v_1..3)
 
-    edge: of a voxel in the end, so that the same logits mean the same density at every resolution
+    edge: of a voxel at the final resolution, so that the same logits mean the same density at every resolution
     """
 
     cheap_density: ClassVar[bool] = True
@@ -87,7 +87,7 @@ class SoftVoxels(Field):
 
 
 class VoxelFit(FieldMethod):
-    """Voxels in the box of interest that learn, double and become a mesh."""
+    """Voxels in the box of interest: trained, upsampled and meshed."""
 
     Config = Config
     network: SoftVoxels
@@ -170,8 +170,8 @@ class VoxelFit(FieldMethod):
 
     @torch.no_grad()
     def mesh(self) -> Mesh:
-        """The surface between voxels that stop more than half of the light and those that stop less, with colours.
-        Raises LumigraphError where none does."""
+        """The surface between voxels with alpha above and below one half, with colours. Raises LumigraphError if
+        there is none."""
         grid = self.network.grid
         values = (grid.values[:, 0] + self.network.shift).view(grid.shape).cpu().numpy().clip(-CLEAR, CLEAR)
         values[binary_fill_holes(values > 0) & (values <= 0)] = CLEAR  # what no camera sees is solid

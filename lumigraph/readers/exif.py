@@ -61,8 +61,7 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
 
     From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
     length in mm and the sensor's pixels per length. None where the original size has another aspect ratio and neither
-    side
-    matches: the reduction is then unknown.
+    side matches: the reduction is then unknown.
     """
     # Software that turns a picture may leave the size at exposure as it was, hence the longer and the shorter side.
     long, short = max(size), min(size)

@@ -325,7 +325,7 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
 
 
 def boxed(crop: Crop | None) -> CropBox | None:
-    """Box that a part stays in; None for one that keeps what is outside a mask."""
+    """Bounding box of a crop; None without one, for a sphere, and for the outside of a mask."""
     if isinstance(crop, VoxelMask):
         return None if crop.outside else crop.box
     return crop if isinstance(crop, CropBox) else None

@@ -1,6 +1,6 @@
-"""A code per photograph: what differs from one to the next, light and colours first, learnt beside the scene.
+"""Appearance embedding: a learnt code per photograph, for light and colours.
 
-Generative latent optimisation (Bojanowski 2018), as Martin-Brualla 2021, section 4.1, has it.
+Generative latent optimisation (Bojanowski 2018), as in Martin-Brualla 2021, section 4.1.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from .layers import MLP
 
 
 def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Tensor, "axis code"]:
-    """Along which codes differ, each as long as their deviation along it: their mean plus `w @ axes` is distributed as
-    the Gaussian that fits them, where w is of the standard normal distribution. None for fewer than two codes.
+    """Principal axes of codes, scaled by their deviations: the mean plus `w @ axes` with standard normal w has the
+    distribution of the fitted Gaussian. None for fewer than two codes.
 
-    least: deviation that every axis has besides; above 0 there are as many axes as numbers
+    least: deviation added to every axis; above 0 there are as many axes as numbers
     """
     if len(codes) < 2:
         return codes[:0]
@@ -43,9 +43,9 @@ def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Ten
 def fitted(
     start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor], steps: int, learning_rate: float
 ) -> Float[Tensor, " width"]:
-    """The numbers that make an error small, by so many steps of Adam from a start, with all else as it is.
+    """Minimise an error over some numbers by `steps` steps of Adam from a start, with everything else fixed.
 
-    error: a number that is differentiable in them
+    error: differentiable function of the numbers
     """
     with torch.enable_grad():
         code = start.detach().clone().requires_grad_()
@@ -68,17 +68,17 @@ FIT_LEAST = 0.03  # deviation also where none of the codes differ; those of trai
 
 @dataclass(frozen=True)
 class Appearance:
-    """A code as evidence: `method.given(Appearance(code))` is the scene as it looks with that code."""
+    """A code as evidence: `method.given(Appearance(code))` is the scene with that appearance."""
 
     code: Float[Tensor, " width"]
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Small patches of pictures as evidence: what they show is compared by the mean colour of each.
+    """Small patches of pictures as evidence, compared by their mean colours.
 
-    Pixel by pixel, noise in the geometry of either side would look like a lack of contrast, and a code be found that
-    takes contrast away.
+    Compared pixel by pixel, noise in either geometry would look like low contrast, and the fitted code would reduce
+    contrast.
 
     batch: rays patch by patch, with their colours
     size:  rays of a patch
@@ -89,10 +89,10 @@ class Patches:
 
 
 class PhotographCodes(Part):
-    """Numbers of each photograph, zero at first; photographs that were not trained on keep zeros.
+    """Code of each photograph, initially zero; photographs outside of training keep zeros.
 
     image_count: photographs of the scene, held-out ones included
-    width:       numbers to a photograph
+    width:       length of a code
     """
 
     def __init__(self, image_count: int, width: int):
@@ -104,21 +104,20 @@ class PhotographCodes(Part):
 
     @property
     def learnt(self) -> Bool[Tensor, " image"]:
-        """The photographs whose codes were learnt."""
+        """Mask of the photographs with trained codes."""
         return (self.codes != 0).any(-1)
 
     @property
     def average(self) -> Float[Tensor, " width"]:
-        """The mean of the codes that were learnt; zeros where none was."""
+        """Mean of the trained codes; zeros without any."""
         learnt = self.learnt
         return self.codes[learnt].sum(0) / max(int(learnt.sum()), 1)
 
     def fitted(
         self, start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor]
     ) -> Float[Tensor, " width"]:
-        """The code that makes an error small and is like those that were learnt: not far from their average, in
-        deviations of theirs. Elsewhere nobody has learnt what a code stands for. The start, where fewer than two were
-        learnt.
+        """Fit a code by an error, regularised by the distribution of the trained codes, since codes far from them are
+        undefined. The start, if fewer than two were trained.
 
         error: the mean squared error of colours, differentiable in the code
         """
@@ -133,7 +132,8 @@ class PhotographCodes(Part):
         return average + fitted(there, likely, FIT_STEPS, FIT_RATE) @ axes
 
     def code_of(self, value: str) -> Float[Tensor, " width"]:
-        """Code of a control's value: a photograph's (the average if not learnt), the average, or one between two."""
+        """Code of a control's value: a photograph's (the average if untrained), the average, or an interpolation of
+        two."""
         first, second, share = blend(value)
         return torch.lerp(self._of(first), self._of(second), share)
 
@@ -148,11 +148,11 @@ class PhotographCodes(Part):
 
 
 class AppearanceCodes(PhotographCodes):
-    """Appearance of each photograph, chosen by the control `appearance` or found for evidence. The field's code begins
-    with it.
+    """Appearance code of each photograph, chosen by the control `appearance` or fitted to evidence. The field's code
+    begins with it.
 
-    evidence: kinds of evidence that an appearance is found for
-    pixels:   of a photograph that are compared
+    evidence: kinds of evidence that an appearance can be fitted to
+    pixels:   number of compared pixels of a photograph
     found:    appearance of the evidence
     """
 
@@ -171,14 +171,14 @@ class AppearanceCodes(PhotographCodes):
         return self.evidence
 
     def shown(self, method: Any) -> Float[Tensor, " width"]:
-        """The code of the settings, else of the evidence, else the average."""
+        """Code of the settings, else of the evidence, else the average."""
         if self.found is not None and "appearance" not in method.settings:
             return self.found
         return self.code_of(str(method.control("appearance")))
 
     def adapted(self, method: Any, evidence: Photograph | Patches | Appearance) -> AppearanceCodes:
-        """The part with the appearance in which the scene looks most like a photograph, by the pixels that are to be
-        trusted (Martin-Brualla 2021, section 5), or like patches of pictures; or with a given one."""
+        """The part with the appearance fitted to a photograph's trusted pixels (Martin-Brualla 2021, section 5), or to
+        patches of pictures; or with a given code."""
         adapted = copy.copy(self)
         adapted.found = self._matched(method, evidence)
         method.settings.pop("appearance", None)
@@ -186,7 +186,7 @@ class AppearanceCodes(PhotographCodes):
 
     @torch.no_grad()
     def _matched(self, method: Any, evidence: Photograph | Patches | Appearance) -> Float[Tensor, " width"]:
-        """The appearance of a piece of evidence; as shown, where no pixel is to be trusted."""
+        """Appearance fitted to a piece of evidence; the current one without trusted pixels."""
         start = self.shown(method)
         if isinstance(evidence, Appearance):
             if evidence.code.shape != start.shape:
@@ -217,10 +217,10 @@ class AppearanceCodes(PhotographCodes):
 
 
 class SkyField(Part):
-    """Colours behind everything (as in Rematas 2022, beside the code).
+    """Learnt sky colours (as in Rematas 2022, beside the code).
 
-    Photographs do not agree on the weather. Without a sky, a transient head would explain all of it, and nothing would
-    be left for the scene.
+    Sky and weather change between photographs. Without a sky, a transient head would explain them, and with them the
+    scene.
     """
 
     def __init__(self, bands: int, code: int, hidden_width: int):
@@ -236,5 +236,5 @@ class SkyField(Part):
 
 
 def sky_for(frame: Frame, wanted: bool, bands: int, code: int, hidden_width: int) -> SkyField | None:
-    """A sky where a scene without bounds shows one, and it is wanted."""
+    """A sky for an unbounded scene, if wanted."""
     return SkyField(bands, code, hidden_width) if wanted and frame.is_open and not frame.has_alpha else None

@@ -1,4 +1,4 @@
-"""Fields in the weights of a coordinate network: of points (Mildenhall 2020), of frustums of cones (Barron 2021)."""
+"""Fields in the weights of a coordinate network: of points (Mildenhall 2020), of conical frustums (Barron 2021)."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ class NetworkNumbers:
     bfloat16: bool = True  # multiply in bfloat16 where the processor is fast at it; off: float32, slower
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
-        """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
+        """Lower bound of the bytes of a step's activations that are kept for gradients."""
         return 2 * samples * self.depth * hidden_width
 
 
 class CoordinateField(Field):
     """Density from position; colour from position, direction and a code (Mildenhall 2020, figure 7).
 
-    Without a code, density and colour are evaluated together, a cacheful of samples at a time. With one, features of
-    all samples are kept, so that colours under several codes need one evaluation.
+    Without a code, density and colour are evaluated together, in cache-sized chunks of samples. With one, features of
+    all samples are kept, so that colours with several codes need one evaluation.
 
     numbers, hidden_width: of the network
-    space:      whose coordinates the network takes
-    code:       width of a code that colour depends on beside the direction, such as an appearance embedding
-    joining:    weights of the octaves, where they join from coarse to fine; None where all count fully
-    keep_input: whether the input itself joins its octaves
+    space:      defines the network's coordinates
+    code:       width of a code, input of the colour beside the direction, such as an appearance embedding
+    joining:    coarse-to-fine weights of the octaves; None for no schedule
+    keep_input: concatenate the raw input with its octaves
     activation: density per unit of the coordinates from the network's output
-    noise:      deviation of noise that is added to the output for density in training
+    noise:      deviation of noise added to raw density in training
     head:       channels of the hidden colour layers; one of half the width by default
     coarse:     field of the coarse pass; None for this one
     latent:     width of a further input of the network, see `LatentField`
@@ -100,7 +100,7 @@ class CoordinateField(Field):
         return self.encode_position(coordinates, self.octave_weights())
 
     def octave_weights(self) -> Float[Tensor, " octave"] | None:
-        """Weights of the octaves that have joined; None where all count fully."""
+        """Coarse-to-fine weights of the octaves; None when all are 1."""
         return self.joining(self.numbers.position_frequencies) if self.joining else None
 
     def activated(self, raw: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
@@ -116,7 +116,7 @@ class CoordinateField(Field):
     def density_at(
         self, *places: Tensor, where: Bool[Tensor, " place"] | None = None, generator: torch.Generator | None = None
     ) -> Float[Tensor, " place"]:
-        """Density alone. where: places that are evaluated; zero elsewhere. generator: of the noise in training"""
+        """Density alone. where: mask of places to evaluate; zero elsewhere. generator: of the noise in training"""
         return in_chunks(
             lambda *x: (self._dense(self.network.density(self.encode(*x)), generator),), *places, where=where
         )[0]
@@ -225,9 +225,9 @@ def shifted_softplus(raw: Tensor) -> Tensor:
 
 
 class FrustumField(CoordinateField):
-    """Density and colour of frustums; of points, as of a small volume around each.
+    """Density and colour of conical frustums; of points, as of a small volume around each.
 
-    padding: by which colours may exceed 0 and 1
+    padding: range of colours beyond 0 and 1
     """
 
     def __init__(self, *arguments: Any, padding: float = COLOUR_PADDING, **named: Any):

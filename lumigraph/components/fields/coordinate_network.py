@@ -22,7 +22,7 @@ class SkipNetwork(nn.Module):
 
     inputs:       width of the encoded position
     depth, width: hidden layers, and their channels
-    skip_layer:   the layer whose activation the input joins again, counted from 1
+    skip_layer:   the layer whose activation is concatenated with the input, counted from 1
     layer:        makes a layer from its inputs, outputs and whether it has a ReLU
     """
 
@@ -74,14 +74,14 @@ class CoordinateNetwork(SkipNetwork):
         return density, self.seen(feature, direction)
 
     def geometry(self, position: Encoded) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample width"]]:
-        """Raw density, and what the colour layers take of each place."""
+        """Raw density, and input of the colour layers at each position."""
         h = self.trunk(position, self.feature)
         return self.density_layer(h).float()[:, 0], self.feature(h)
 
     def seen(
         self, feature: Float[Tensor, "sample width"], direction: Float[Tensor, "sample direction"]
     ) -> Float[Tensor, "sample 3"]:
-        """Raw colour of places whose features `geometry` gave."""
+        """Raw colour from features of `geometry`."""
         return self.colour(torch.cat([feature, direction.to(feature.dtype)], -1)).float()
 
     def density(self, position: Encoded) -> Float[Tensor, " sample"]:

@@ -1,4 +1,4 @@
-"""Networks of deformations: numbers at a point and a code, whose octaves join from coarse to fine (Park 2021)."""
+"""Deformation networks: numbers at a point and a code, with coarse-to-fine octaves (Park 2021)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ FIRST_MOTION = 1e-4  # largest weight of the last layer at first: the scene begi
 
 
 def window(bands: int, alpha: Tensor) -> Float[Tensor, " band"]:
-    """Weights of an encoding's bands, the first alpha of which are there (Park 2021, eq. 8)."""
+    """Coarse-to-fine weights of an encoding's bands, of which the first alpha are active (Park 2021, eq. 8)."""
     j = torch.arange(bands, device=alpha.device)
     return (1 - torch.cos(math.pi * (alpha - j).clamp(0, 1))) / 2
 
 
 class DeformationNetwork(SkipNetwork):
-    """Numbers at a point and a code: hidden layers over the encoded point beside the code, and a last one that begins
+    """Numbers at a point and a code: hidden layers over the encoded point and the code, and a last one initialised
     close to zero."""
 
     def __init__(self, bands: int, code: int, depth: int, width: int, skip_layer: int, outputs: int):
@@ -41,7 +41,7 @@ class DeformationNetwork(SkipNetwork):
         return in_chunks(answer, points, code)[0]
 
     def differentiable(self, points: Tensor, code: Tensor, weights: Tensor) -> Tensor:
-        """The same in plain PyTorch and float32, whose derivatives in points can be differentiated again."""
+        """The same in plain PyTorch and float32, for second derivatives in points."""
         first = torch.cat([self.encoding(points, weights), code], -1)
         x = self._plain(self.before, first)
         x = self._plain(self.after, torch.cat([first, x], -1))

@@ -1,4 +1,4 @@
-"""Encodings of points as waves, so that a network of few inputs can show fine detail (Tancik 2020, Mildenhall 2020)."""
+"""Frequency encodings of points, so that a network can represent fine detail (Tancik 2020, Mildenhall 2020)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class FrequencyEncoding(nn.Module):
     bands:      L, octaves
     keep_input: whether p itself comes first
     base:       angle at p = 1 in the first band; pi in the paper, 1 in its published code
-    Sine and cosine of every octave are taken anew. Doubling angles is no quicker in PyTorch, and at 10 bands it is off
-    by up to 9e-4 in float32, against 1e-4 (for base 1 by 5e-4, against 4e-8).
+    Every octave computes its own sine and cosine. Doubling angles is not faster in PyTorch, and at 10 bands it has an
+    error of up to 9e-4 in float32, against 1e-4 (for base 1 of 5e-4, against 4e-8).
     """
 
     octaves: Tensor
@@ -34,7 +34,7 @@ class FrequencyEncoding(nn.Module):
     def forward(
         self, points: Float[Tensor, "sample input"], weights: Float[Tensor, " octave"] | None = None
     ) -> Float[Tensor, "sample feature"]:
-        """weights: of the octaves, where not all count fully; see `training.schedules.band_weights`"""
+        """Encode points. weights: coarse-to-fine weights of the octaves; see `training.schedules.band_weights`"""
         angles = self.octaves[:, None] * points[:, None]  # (sample, octave, input)
         waves = weighted(torch.stack([angles.sin(), angles.cos()], 2), weights).flatten(1)
         return torch.cat([points, waves], 1) if self.keep_input else waves
@@ -47,7 +47,7 @@ class IntegratedEncoding(nn.Module):
 
     inputs: coordinates of a point
     bands:  L, octaves
-    Only the variances along each coordinate are needed, for the encoding takes each by itself (eq. 13).
+    Only variances along each coordinate are needed, since the encoding is separable (eq. 13).
     """
 
     octaves: Tensor
@@ -63,7 +63,7 @@ class IntegratedEncoding(nn.Module):
         variances: Float[Tensor, "sample input"],
         weights: Float[Tensor, " octave"] | None = None,
     ) -> Float[Tensor, "sample feature"]:
-        """weights: of the octaves, where not all count fully; see `training.schedules.band_weights`"""
+        """Encode Gaussians. weights: coarse-to-fine weights of the octaves; see `training.schedules.band_weights`"""
         angles = self.octaves[:, None] * means[:, None]  # (sample, octave, input)
         left = torch.exp(-0.5 * self.octaves.square()[:, None] * variances[:, None])
         return weighted(torch.stack([angles.sin() * left, angles.cos() * left], 2), weights).flatten(1)
@@ -76,11 +76,11 @@ def weighted(
 
 
 class FourierEncoding(nn.Module):
-    """Waves in the directions and at the frequencies that the rows of B hold (Tancik 2020, section 4).
+    """Fourier features with frequencies in the rows of B (Tancik 2020, section 4).
 
         gamma(p) = (cos(2 pi B p), sin(2 pi B p))
 
-    frequencies: B, in cycles per unit of p. It is fixed, and saved with the method that holds it.
+    frequencies: B, in cycles per unit of p. It is fixed, and saved with its method.
     """
 
     frequencies: Tensor

@@ -39,7 +39,7 @@ class TableNumbers:
     max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # cells per axis of the finest level, N_max; times reach
 
     def check(self) -> None:
-        """Raises LumigraphError for numbers of levels that contradict each other."""
+        """Raise LumigraphError for inconsistent numbers of levels."""
         if self.base_resolution > self.max_resolution:
             raise LumigraphError(
                 f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
@@ -64,7 +64,7 @@ class TableNumbers:
 
 @dataclass(frozen=True)
 class HashNumbers(TableNumbers):
-    """The same with numbers of the networks behind the table (section 5.4)."""
+    """Numbers of the hash table and of the networks behind it (section 5.4)."""
 
     colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4; more cost time
     geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
@@ -91,10 +91,10 @@ class HashField(Field):
     """Density from position; colour from position, direction and a code (Müller 2022, figure 3 and section 5.4).
 
     numbers: of table and networks
-    space:   whose coordinates the table covers
-    reach:   half-size of the cube that a bounded scene lies in
-    code:    width of a code that colour depends on beside the direction, such as an appearance embedding
-    joining: weights of the levels, where they join from coarse to fine; None where all count fully
+    space:   defines the table's coordinates
+    reach:   half-size of the cube of a bounded scene
+    code:    width of a code, input of the colour beside the direction, such as an appearance embedding
+    joining: coarse-to-fine weights of the levels; None for no schedule
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class HashField(Field):
     def decode(
         self, points: Float[Tensor, "point 3"], encoded: Float[Tensor, "point width"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
-        """Density per scene unit and geometry features of points that were encoded."""
+        """Density per scene unit and geometry features of encoded points."""
         geometry = self.density_network(encoded)
         return truncated_exp(geometry[:, 0]) * self.space.stretch(points), geometry
 
@@ -145,9 +145,9 @@ class HashField(Field):
     def optimizers_at(
         self, learning_rate: float, weight_decay: float = 0.0, scale: float | None = None, groups: Any = ()
     ) -> list[torch.optim.Optimizer]:
-        """Adam for the table, whose rows are updated where they were looked up, and for the networks (section 4).
+        """Adam for the table, updated only at looked-up rows, and for the networks (section 4).
 
-        scale:  share of the learning rate that the networks learn at; None for 1, or OPEN_RATE in the open
+        scale:  relative learning rate of the networks; None for 1, or OPEN_RATE in unbounded scenes
         groups: further groups of parameters
         """
         common: dict[str, Any] = {"lr": learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
@@ -157,11 +157,11 @@ class HashField(Field):
         return [table, torch.optim.Adam([group, *groups], foreach=True, **common)]
 
     def storage(self) -> dict[str, Stored]:
-        """The table as whole numbers, the networks as halves."""
+        """Storage: the table as integers, the networks as float16."""
         networks = [name for name, _ in self.named_parameters() if name != "table"]
         return {"table": Stored("scaled"), **dict.fromkeys(networks, Stored("half"))}
 
 
 def side_by_side(*features: Float[Tensor, "sample _"]) -> Float[Tensor, "sample width"]:
-    """Features of samples joined as `kernels.perceptron` reads them quickest, all samples' first one, then the next."""
+    """Concatenate features of samples in the feature-major layout of `kernels.perceptron`."""
     return torch.cat([x.t() for x in features]).t()

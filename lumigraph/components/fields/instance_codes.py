@@ -1,4 +1,4 @@
-"""Codes of a collection's members, learnt beside a decoder (auto-decoder), and those between and beside them."""
+"""Latent codes of a collection's members, trained with a decoder (auto-decoder), with interpolation and sampling."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ FOUND = "found"  # the choice that evidence gave
 
 
 class InstanceCodes(nn.Module):
-    """Numbers of each member, zeros of those that are not learnt from.
+    """Code of each member, zeros for untrained ones.
 
-    most:  members that there are room for
-    width: numbers of a code
+    most:  largest number of members
+    width: length of a code
     """
 
     def __init__(self, most: int, width: int):
@@ -25,7 +25,7 @@ class InstanceCodes(nn.Module):
         self.rows = nn.Parameter(torch.zeros(most, width))
 
     def check_room(self, members: int, source: str) -> None:
-        """Raises LumigraphError for more members than rows."""
+        """Raise LumigraphError for more members than rows."""
         if members > len(self.rows):
             raise LumigraphError(
                 f"{source} has {members} members, and there is room for {len(self.rows)} codes; "
@@ -34,7 +34,7 @@ class InstanceCodes(nn.Module):
 
     @torch.no_grad()
     def begin(self, members: Int[Tensor, " member"], deviation: float, generator: torch.Generator) -> None:
-        """Random codes for the members to learn from."""
+        """Initialise random codes of the training members."""
         drawn = deviation * torch.randn(len(members), self.rows.shape[1], generator=generator)
         self.rows[members.to(self.rows.device)] = drawn.to(self.rows.device)
 
@@ -43,46 +43,46 @@ class InstanceCodes(nn.Module):
 
     @property
     def learnt(self) -> Bool[Tensor, " member"]:
-        """The members whose codes were learnt."""
+        """Mask of the members with trained codes."""
         return (self.rows != 0).any(-1)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Numbers of the members whose codes were learnt, as text."""
+        """Numbers of the members with trained codes, as text."""
         return tuple(str(number) for number in self.learnt.nonzero()[:, 0].tolist())
 
     @property
     def average(self) -> Float[Tensor, " code"]:
-        """The mean of the codes that were learnt; zeros where none was."""
+        """Mean of the trained codes; zeros without any."""
         known = self.rows.detach()[self.learnt]
         return known.mean(0) if len(known) else self.rows.detach()[0]
 
     @property
     def axes(self) -> Float[Tensor, "axis code"]:
-        """Along which the codes that were learnt differ, each as long as their deviation along it: `average + w @ axes`
-        is distributed as the Gaussian that fits them, where w is of the standard normal distribution."""
+        """Principal axes of the trained codes, scaled by their deviations: `average + w @ axes` with standard normal w
+        has the distribution of the fitted Gaussian."""
         return axes_of(self.rows.detach()[self.learnt])
 
     def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
-        """Coordinates of a code along the axes, in deviations from the average."""
+        """Coordinates of a code along the principal axes, in deviations from the average."""
         axes = self.axes
         return (code - self.average) @ axes.T / axes.square().sum(-1)
 
     def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
-        """A code from the Gaussian that fits those that were learnt."""
+        """Random code from the Gaussian fitted to the trained codes."""
         axes = self.axes
         return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
 
     def code_of(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
-        """The code that a control's value stands for: a member's, the average, one of the others by its name, or one
-        between two, as `controls.blend` takes values apart."""
+        """Code of a control's value: a member's, the average, a named one, or an interpolation of two, parsed by
+        `controls.blend`."""
         known = {AVERAGE: self.average} | others
         first, second, share = blend(value)
         a, b = (known[x] if x in known else self.rows.detach()[int(x)] for x in (first, second))
         return torch.lerp(a, b, share)
 
     def control(self, found: bool) -> Control:
-        """Control of the instance that is shown. found: whether there is a code of evidence, then the default"""
+        """Control of the current instance. found: whether there is a code of evidence, then the default"""
         choices = (*([FOUND] if found else []), AVERAGE, *self.names)
         about = "Which object is shown: the one that was found or drawn, a member of the collection by its number, or "
         about += "the average of all."

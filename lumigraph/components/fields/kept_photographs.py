@@ -1,4 +1,4 @@
-"""Photographs of a collection's members to learn from, and photographs that a method keeps among its tensors."""
+"""Training photographs of a collection's members, and photographs stored among a method's tensors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Taken:
 
 
 class Kept(nn.Module):
-    """Rows of which a saved one may have any number."""
+    """Buffer whose number of rows is that of the saved one."""
 
     grows: ClassVar[tuple[str, ...]] = ("rows",)
     rows: Tensor
@@ -44,9 +44,9 @@ class Kept(nn.Module):
 
 
 class KeptPhotographs(nn.Module):
-    """Photographs and their cameras, and what was found in them: a row of features for each cell, if anything was.
+    """Photographs with cameras, and optionally features: a row for each cell.
 
-    features: numbers in a row
+    features: length of a row
     """
 
     def __init__(self, features: int):
@@ -60,7 +60,7 @@ class KeptPhotographs(nn.Module):
 
     @staticmethod
     def of(photographs: list[Photograph], background: Vector, features: int) -> KeptPhotographs:
-        """Their colours before a background, eight bits of each."""
+        """Photographs' colours over a background, with eight bits."""
         kept = KeptPhotographs(features)
         camera = Camera.cat([photograph.camera for photograph in photographs]).to("cpu")
         said = {"pose": camera.pose.tolist(), "lens": camera.lens.to_json(), "size": camera.size.tolist()}
@@ -84,7 +84,7 @@ class KeptPhotographs(nn.Module):
 
 
 def padded(pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view 3 height width"]:
-    """Pictures of any sizes as one batch: smaller ones go on at their right and bottom with what is at the border."""
+    """Pictures of any sizes as one batch, padded at right and bottom by their border."""
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
 
     def grown(picture: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ def padded(pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view 3 heig
 
 
 def photographed(member: Dataset, method: str) -> Scene:
-    """A member as photographs. Raises LumigraphError for any other kind. method: to name"""
+    """A member as photographs. Raises LumigraphError for any other kind. method: named in the error"""
     if not isinstance(member, Scene):
         raise LumigraphError(
             f"{method} learns from collections of photographs, and {member.source} holds {member.kind}; "
@@ -105,7 +105,7 @@ def photographed(member: Dataset, method: str) -> Scene:
 
 
 def rays_through(photographs: Sequence[Photograph], count: int, boxed: bool, generator: torch.Generator) -> Batch:
-    """Random pixels of photographs, about as many of each. boxed: see `pixels_of`"""
+    """Rays of random pixels, about as many of each photograph. boxed: see `pixels_of`"""
     parts = []
     counts = [len(x) for x in torch.arange(count).tensor_split(len(photographs))]
     for photograph, wanted in zip(photographs, counts, strict=True):
@@ -120,7 +120,7 @@ def rays_through(photographs: Sequence[Photograph], count: int, boxed: bool, gen
 
 
 def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
-    """Pixels (x, y) to be trusted; boxed: within the box around what is opaque, where anything is."""
+    """Trusted pixels (x, y); boxed: only those in the bounding box of opaque ones, if any."""
     height, width = photograph.rgb.shape[:2]
     there = torch.ones(height, width, dtype=torch.bool) if photograph.mask is None else photograph.mask.clone()
     if boxed and photograph.alpha is not None and (opaque := photograph.alpha > 0.5).any():
@@ -132,7 +132,7 @@ def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
 
 
 def square(photograph: Photograph, frame: Frame, size: int) -> tuple[Float[Tensor, "3 size size"], Camera]:
-    """The middle square of a photograph before its background, at a size, and its camera."""
+    """Central square of a photograph over its background, resized, and its camera."""
     rgb, camera = photograph.before(frame.background).permute(2, 0, 1), photograph.camera
     height, width = rgb.shape[1:]
     side = min(height, width)

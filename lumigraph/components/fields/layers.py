@@ -1,4 +1,4 @@
-"""Layers of networks: wide ones in bfloat16 where the machine is fast at it, small perceptrons, activations."""
+"""Network layers: wide ones in bfloat16 if the machine is fast at it, small perceptrons, activations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROUND = 1 << 10  # the last chunk is filled up to a multiple of this: oneDNN com
 
 @cache
 def product_type(device: torch.device) -> torch.dtype:
-    """The type that layers multiply in: bfloat16 where the processor has instructions for it, float32 elsewhere."""
+    """Type of matrix products: bfloat16 if the processor has instructions for it, else float32."""
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     there = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
@@ -29,10 +29,10 @@ def product_type(device: torch.device) -> torch.dtype:
 
 
 class Dense(nn.Linear):
-    """y = W x + b, or max(0, W x + b): weights as Glorot drew them (2010), biases zero.
+    """y = W x + b, or max(0, W x + b), with Glorot initialisation (2010) and zero biases.
 
     exact: multiply in float32 even where bfloat16 is faster
-    Output is of the type that products are taken in; what comes next takes it as it is.
+    Output has the type of products, which the next layer accepts.
     """
 
     def __init__(self, inputs: int, outputs: int, relu: bool = False, exact: bool = False):
@@ -75,7 +75,7 @@ def _onednn_has_bfloat16() -> bool:
 
 
 def _activated(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
-    """max(0, x W^T + b), in one pass over the output where oneDNN offers it: half the time of two."""
+    """max(0, x W^T + b), fused where oneDNN offers it, which halves the time."""
     if x.dtype == torch.bfloat16 and x.device.type == "cpu" and len(x) and _onednn_has_bfloat16():
         return torch.ops.mkldnn._linear_pointwise(x, w, b, "relu", [], "")
     return F.linear(x, w, b).relu_()
@@ -84,9 +84,9 @@ def _activated(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
 def in_chunks(
     network: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, where: Bool[Tensor, " sample"] | None = None
 ) -> tuple[Tensor, ...]:
-    """A network's outputs for very many samples, which it is given a cacheful at a time.
+    """A network's outputs for many samples, in cache-sized chunks.
 
-    where: the samples to give it; outputs are zero elsewhere
+    where: mask of samples to evaluate; outputs are zero elsewhere
     """
     total, device = len(inputs[0]), inputs[0].device
     asked = torch.arange(total, device=device) if where is None else where.nonzero()[:, 0]
@@ -100,7 +100,7 @@ def in_chunks(
 
 
 class MLP(nn.Module):
-    """`kernels.perceptron` with weights of its own: MLP(inputs, hidden, ..., outputs)."""
+    """`kernels.perceptron` with its own weights: MLP(inputs, hidden, ..., outputs)."""
 
     def __init__(self, *widths: int):
         super().__init__()
@@ -144,5 +144,5 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """exp(x), with a gradient no steeper than e^15, so that one dense sample cannot blow up a step (Müller 2022)."""
+    """exp(x), with a gradient clamped at e^15, so that one dense sample cannot blow up a step (Müller 2022)."""
     return _TruncatedExp.apply(x)

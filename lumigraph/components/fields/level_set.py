@@ -12,9 +12,9 @@ GREY = 160  # of a mesh that has no colours yet
 
 
 def level_set(values: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], cell: float | np.ndarray) -> Mesh:
-    """The grey surface at which values on a grid are zero, positive inside; closed where the grid ends.
+    """Grey mesh of the zero level of values on a grid, positive inside; closed at the grid's border.
 
-    low:  place of the first corner
+    low:  position of the first corner
     cell: distance of corners, one for all axes or one for each
     """
     closed = np.pad(values, 1, constant_values=min(float(values.min()), -1e-3))

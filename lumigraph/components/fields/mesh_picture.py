@@ -1,4 +1,4 @@
-"""A mesh through a camera: colour, normals, depth and opacity of every pixel, with gradients across silhouettes."""
+"""Differentiable rasterisation of a mesh: colour, normals, depth and opacity of every pixel."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ...errors import LumigraphError
 
 @dataclass(frozen=True)
 class Picture:
-    """Values over black of each pixel, antialiased, and the depth of its centre.
+    """Antialiased values over black of each pixel, and the depth of its centre.
 
     values:  attributes of vertices, times opacity
-    opacity: share of the pixel that the mesh covers
-    depth:   distance along the ray; infinity where the centre sees nothing
+    opacity: coverage of the pixel by the mesh
+    depth:   distance along the ray; infinity for empty centres
     """
 
     values: Float[Tensor, "height width channel"]
@@ -48,8 +48,8 @@ def picture(
 
 
 def projected(points: Float[Tensor, "point 3"], camera: Camera) -> Float[Tensor, "point 3"]:
-    """Homogeneous pixels of points: pixels times depth, and depth. A distortion bends vertices and not the edges
-    between them. Raises LumigraphError for lenses without a flat picture."""
+    """Homogeneous pixels of points: pixels times depth, and depth. Lens distortion moves vertices; edges stay straight.
+    Raises LumigraphError for lenses without a flat picture."""
     lens = camera.lens[0] if isinstance(camera.lens, Mixed) else camera.lens
     if not isinstance(lens, Pinhole | OpenCV):
         raise LumigraphError(

@@ -1,8 +1,7 @@
-"""Spaces: the coordinates in which a network sees a scene, and the stretch of each ray that is sampled.
+"""Spaces: coordinates of a network's input, and the sampled interval of each ray.
 
-A network sees coordinates of about [-1, 1], evenly. An object fits as it is, a capture that looks one way fits in
-normalised device coordinates (Mildenhall 2020, appendix C), anything else is contracted into a ball (Barron 2022,
-section 3).
+Coordinates are about uniform in [-1, 1]. An object is used unchanged, a forward-facing capture in normalised device
+coordinates (Mildenhall 2020, appendix C), anything else is contracted into a ball (Barron 2022, section 3).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is sai
 
 
 def space_of(frame: Frame) -> Space:
-    """The space that suits a scene."""
+    """Space for a scene's frame."""
     if not frame.is_open:
         return Box(frame.bounds, frame.near)
     if frame.forward is not None:
@@ -34,28 +33,28 @@ def space_of(frame: Frame) -> Space:
 
 
 def contraction_of(frame: Frame) -> Contraction:
-    """The ball that holds all of an open capture."""
+    """Contraction of an unbounded capture."""
     return Contraction(frame.near, 2 * math.sqrt(3) * frame.reach)
 
 
 class Space(ABC):
-    """A map from the scene to coordinates, and the part of each ray that it covers.
+    """A map from the scene to coordinates, and the interval of each ray that it covers.
 
-    Plain numbers, so that it works on any device and in any precision.
-    is_open: whether it covers a scene without bounds
+    In plain numbers, so that it works on any device and in any precision.
+    is_open: whether it covers an unbounded scene
     """
 
     is_open: ClassVar[bool] = True
 
     @abstractmethod
     def interval(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Near and far end of each ray's samples, in scene units: finite, and equal for rays that see nothing."""
+        """Near and far end of each ray's samples, in scene units: finite, and equal for rays that miss."""
 
     @abstractmethod
     def distance(
         self, share: Float[Tensor, "ray sample"], rays: Rays, near: Float[Tensor, " ray"], far: Float[Tensor, " ray"]
     ) -> Float[Tensor, "ray sample"]:
-        """Distances at shares of the way from near to far, as this space measures it: exact at 0 and 1, growing."""
+        """Distances at positions from 0 (near) to 1 (far) in this space's measure: exact at both ends, ascending."""
 
     @abstractmethod
     def warp(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
@@ -63,7 +62,7 @@ class Space(ABC):
 
     @abstractmethod
     def unwarp(self, coordinates: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points with these coordinates; the farthest in about that direction for coordinates that no point has."""
+        """Points with these coordinates; clamped for coordinates outside the space's image."""
 
     @abstractmethod
     def jacobian(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
@@ -71,14 +70,14 @@ class Space(ABC):
 
     @abstractmethod
     def stretch(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """|det J|^(1/3): the length in coordinates of a unit of the scene, whatever its direction."""
+        """|det J|^(1/3): mean scale from scene units to coordinates."""
 
     def mapped(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
         """Coordinates of points, and `stretch` there."""
         return self.warp(points), self.stretch(points)
 
     def along(self, rays: Rays, samples: Samples) -> Float[Tensor, " sample"]:
-        """Coordinates that a ray passes in a unit of the scene, averaged over each sample."""
+        """Speed of a ray in coordinates per scene unit, averaged over each sample."""
         ray = samples.ray_index
         first, last = (
             self.warp(rays.origins[ray] + t[:, None] * rays.directions[ray]) for t in (samples.t_start, samples.t_end)
@@ -92,7 +91,7 @@ class Space(ABC):
         along: Float[Tensor, " n"],
         across: Float[Tensor, " n"],
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-        """Coordinates of Gaussians, and their variances along each coordinate, to first order (Barron 2022, eq. 9).
+        """Coordinates of Gaussians, and their variances along each coordinate, by linearisation (Barron 2022, eq. 9).
 
         directions: unit length; variances in squared scene units along and across them
         The diagonal of J S J^T with S = along d d^T + across (I - d d^T); with J = I it is Barron 2021, eq. 16.
@@ -105,7 +104,7 @@ class Space(ABC):
 
 @dataclass(frozen=True)
 class Box(Space):
-    """An object: the scene as it is, evenly along each ray through its bounds."""
+    """Bounds of an object, without a map; samples are uniform along each ray."""
 
     bounds: tuple[Vector, Vector]
     near: float
@@ -145,8 +144,8 @@ class NDC(Space):
     """Normalised device coordinates of the mean camera: (s_x x / z, s_y y / z, 1 - 2 n / z), n the near plane.
 
     Mildenhall 2020, appendix C, which looks along -z where we look along +z. The frustum beyond the near plane becomes
-    a cube, and lines stay lines. Samples are even in the paper's t', from the near plane, or from the frame's near
-    distance where a camera stands beyond, to nearly infinity. What lies before the plane is taken for what is on it.
+    a cube, and lines stay lines. Samples are linear in the paper's t', from the near plane, or from the frame's near
+    distance for cameras beyond it, to nearly infinity. Points in front of the plane are clamped to it.
     """
 
     forward: Forward
@@ -211,16 +210,17 @@ class NDC(Space):
         return x, y, z.clamp_min(self.forward.near)
 
     def _depths(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Depth z of each ray's origin, and how fast it grows; no less than what counts as looking ahead."""
+        """Depth z of each ray's origin, and its derivative along the ray, clamped below for rays not looking ahead."""
         pose = self._pose(rays.origins)
         return (rays.origins - pose[:, 3]) @ pose[:, 2], (rays.directions @ pose[:, 2]).clamp_min(SIDEWAYS)
 
 
 @dataclass(frozen=True)
 class Contraction(Space):
-    """Everything in a ball of radius 1: half of contract(x), x inside the unit ball and (2 - 1 / |x|) x / |x| outside.
+    """Contraction of space into a ball of radius 1: half of contract(x), x inside the unit ball and (2 - 1 / |x|) x /
+    |x| outside.
 
-    Barron 2022, eq. 10. Samples are even in disparity, 1 / t, which far out is even in coordinates (section 3).
+    Barron 2022, eq. 10. Samples are linear in disparity, 1 / t, which far out is linear in coordinates (section 3).
     """
 
     near: float
@@ -265,20 +265,20 @@ class Contraction(Space):
         return points.norm(dim=-1).clamp_min(1)  # with 1, what holds outside holds inside too
 
     def _across(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Coordinates for a unit of the scene at right angles to the way out."""
+        """Scale from scene units to coordinates, tangentially."""
         radius = self._radius(points)
         return 0.5 * (2 - 1 / radius) / radius
 
     def _radial(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Coordinates for a unit of the scene on the way out."""
+        """Scale from scene units to coordinates, radially."""
         return 0.5 / self._radius(points).square()
 
 
 def fits_kernels(points: Tensor) -> bool:
-    """True for points that kernels without gradients take: float32, and no gradient is asked for."""
+    """True for points supported by kernels without gradients: float32, without gradients."""
     return points.dtype == torch.float32 and not (torch.is_grad_enabled() and points.requires_grad)
 
 
 def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """Share of the way from first to last at x, where 1 / x has gone a share of its own way."""
+    """Interpolation from first to last, linear in disparity. Returns its position between them."""
     return share * first / (share * first + (1 - share) * last)

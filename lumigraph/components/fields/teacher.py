@@ -1,8 +1,8 @@
-"""Teachers: density and colour of another method at points, as far as cameras see them, and distillation from these.
+"""Teachers: density and colour of another method at points in its cameras' view, and distillation from these.
 
-A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, is rendered into depth maps,
-which are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
-cameras see past it: a field may say anything of space that its own pictures never ask about.
+A teacher with a `field` is evaluated. One without, such as a cloud of Gaussians, is rendered to depth maps, which are
+fused into a shell of density around its surfaces (Curless and Levoy 1996). Free space of the cameras is always empty: a
+field is arbitrary where its own pictures never sample it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
 
 
 def teacher_of(teacher: Any, cameras: Camera) -> Teacher:
-    """A teacher with depth maps of cameras around it. Raises LumigraphError where they see nothing solid."""
+    """Teacher with depth maps of cameras around it. Raises LumigraphError if they show no surface."""
     depth_maps = render_depth_maps(teacher.render, cameras, teacher.frame.background, VIEWS, SIZE)
     return FieldTeacher(depth_maps, teacher) if can(teacher, HasField) else DepthTeacher(depth_maps)
 
@@ -55,20 +55,20 @@ class Teacher(ABC):
 
     @abstractmethod
     def _density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit, wherever it is."""
+        """Density per scene unit, without removing free space."""
 
     @abstractmethod
     def glance(self, points: Float[Tensor, "point 3"], depth_map: DepthMap) -> Float[Tensor, "point 3"]:
-        """The colours that points have, sRGB-encoded, seen from where one camera is."""
+        """Colours of points, sRGB-encoded, seen from one camera."""
 
     @cached_property
     def surface(self) -> SurfacePoints:
-        """Points of the surfaces that cameras see."""
+        """Points of the surfaces in the cameras' view."""
         return surface_points(self.depth_maps)
 
     @torch.no_grad()
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit; none where cameras see past."""
+        """Density per scene unit; zero in the cameras' free space."""
         found = []
         for part in points.split(AT_ONCE):
             there = (~free(part, self.depth_maps)).nonzero()[:, 0]
@@ -79,8 +79,8 @@ class Teacher(ABC):
     def density_around(
         self, points: Float[Tensor, "point 3"], size: Float[Tensor, " point"], chance: torch.Generator, count: int = 4
     ) -> Float[Tensor, " point"]:
-        """Density per scene unit with which a cube of such a side stops as much light as the one around each point does
-        on average, asked at some random places in it."""
+        """Density per scene unit of a homogeneous cube with the mean opacity of the cube around each point, sampled at
+        some random positions in it."""
         passed = torch.zeros(len(points))
         for _ in track(range(count), "Taking over density", count):
             moved = points + (torch.rand(points.shape, generator=chance) - 0.5) * size[:, None]
@@ -91,8 +91,8 @@ class Teacher(ABC):
     def harmonics(
         self, points: Float[Tensor, "point 3"], bands: int, of: Callable[[Tensor], Tensor]
     ) -> Float[Tensor, "point coefficient 3"]:
-        """Spherical harmonics of a function of each point's colour, by least squares over the directions of cameras
-        that see it; those beyond the first are held small where few do."""
+        """Spherical harmonics of a function of each point's colour, by regularised least squares over the directions of
+        cameras that see it."""
         chosen, width = evenly(self.depth_maps, ASKED), bands**2
         held = torch.cat([torch.tensor([1e-4]), torch.full((width - 1,), STIFFNESS)]).diag()
         found = []
@@ -114,10 +114,9 @@ class Teacher(ABC):
     def occupied(
         self, space: Space, cells: int, thickness: float, chance: torch.Generator
     ) -> Bool[Tensor, "cell cell cell"]:
-        """Mask of the cells of a space's [-1, 1]^3, so many along each axis, that hold something or are beside one
-        that does: from coarse to fine.
+        """Mask of the occupied cells of a space's [-1, 1]^3, dilated by one, from coarse to fine. cells: along an axis
 
-        thickness: optical thickness across a cell from which on there is something in it
+        thickness: optical thickness across an occupied cell
         """
         n = min(cells, COARSE)
         held = torch.ones(n, n, n, dtype=torch.bool)
@@ -141,8 +140,8 @@ class Teacher(ABC):
 
     @torch.no_grad()
     def places(self, space: Space, count: int, chance: torch.Generator) -> Float[Tensor, "point 3"]:
-        """Random points of the scene to learn from: half of them near surfaces, a quarter before these, as cameras see
-        them, and a quarter anywhere in the space's [-1, 1]^3."""
+        """Random training points: half of them near surfaces, a quarter between cameras and surfaces, and a quarter
+        uniform in the space's [-1, 1]^3."""
         near, before = count // 2, count // 4
         known = self.surface
         if not len(known):
@@ -175,9 +174,9 @@ class FieldTeacher(Teacher):
 
 
 class DepthTeacher(Teacher):
-    """Teacher of depth maps: a shell around the surfaces that they show, solid from half its thickness on.
+    """Teacher of depth maps: a shell around their surfaces, solid over half its thickness.
 
-    It has a `field` itself, so it can stand for its teacher wherever one is needed that has.
+    It has a `field` itself, so it can replace its teacher wherever one is needed.
     """
 
     device = torch.device("cpu")
@@ -188,7 +187,7 @@ class DepthTeacher(Teacher):
 
     @torch.no_grad()
     def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
-        """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
+        """Density per scene unit, and the colour of the camera closest to the viewing direction."""
         best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
         for depth_map in self.depth_maps:
             along = (unit(points - depth_map.camera.position) * directions).sum(-1)
@@ -210,12 +209,12 @@ def density_of(teacher: Any) -> Callable[[Points], Densities]:
 
 
 def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-    """Logit of colours, clamped off black and white."""
+    """Logit of colours, clamped away from black and white."""
     return rgb.clamp(0.01, 0.99).logit()
 
 
 def cells_of(coordinates: Float[Tensor, "point 3"], n: int) -> Tensor:
-    """The cells, of n along each axis of [-1, 1]^3, that coordinates lie in."""
+    """Cells of coordinates, of n along each axis of [-1, 1]^3."""
     return ((coordinates + 1) * (n / 2)).long().clamp(0, n - 1)
 
 
@@ -243,14 +242,14 @@ def distil(
     chance: torch.Generator,
     device: torch.device | str = "cpu",
 ) -> None:
-    """Teach a field what another one holds.
+    """Distil a teacher into a field.
 
         L = mean (log(1 + sigma d) - log(1 + sigma' d))^2 + mean a' |c - c'|^2,    a' = 1 - exp(-sigma' d)
 
-    over places near surfaces, before them and anywhere, colours along the way from a camera that sees the place.
-    d is CELL of the coordinates, or CLEAR where the teacher holds nothing; where it is solid, it is enough to be solid
-    too. The optimizers go at the rates that they have, which fall.
-    points: that a step learns from
+    over points near surfaces, in front of them and anywhere, colours along rays of cameras that see the point.
+    d is CELL of the coordinates, or CLEAR where the teacher is empty; where it is solid, any solid density suffices.
+    The optimizers' learning rates decay from their current values.
+    points: number of points per step
     """
     places = held_by.places(space, POOL * points, chance)
     directions, rgb, seen = glances(held_by, places, chance)
@@ -283,7 +282,7 @@ def distil(
 def glances(
     held_by: Teacher, places: Float[Tensor, "point 3"], chance: torch.Generator
 ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-    """For each place the direction from a random camera, the colour from there, and whether (0 or 1) it is seen."""
+    """For each point the direction from a random camera, the colour from there, and its visibility (0 or 1)."""
     directions, rgb, seen = torch.zeros_like(places), torch.full_like(places, 0.5), torch.zeros(len(places))
     camera = torch.randint(len(held_by.depth_maps), (len(places),), generator=chance)
     for i, depth_map in enumerate(track(held_by.depth_maps, "Asking the teacher", len(held_by.depth_maps))):

@@ -1,4 +1,4 @@
-"""Voxel grids that learn: values at the corners of voxels in a box, which may be made finer and the box tighter."""
+"""Trainable voxel grids: values at voxel corners in a box, which may be refined and shrunk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Box = Float[Tensor, "2 3"]  # the lower corner and the upper
 
 
 def shape_of(sides: Float[Tensor, " 3"] | list[float], voxels: int) -> tuple[int, int, int]:
-    """Corners along each axis of about so many voxels, as long as wide, in a box with these sides, two at least."""
+    """Corners along each axis, two at least, of about `voxels` cubic voxels in a box with these sides."""
     sides = [float(x) for x in sides]
     edge = (math.prod(sides) / voxels) ** (1 / 3)
     x, y, z = (max(1, round(side / edge)) + 1 for side in sides)
@@ -34,9 +34,9 @@ def corners(box: Box, shape: tuple[int, int, int]) -> Float[Tensor, "corner 3"]:
 
 
 def tight_box(box: Box, inside: Bool[Tensor, "x y z"]) -> Box:
-    """The smallest box around the corners that a mask picks, and a voxel around it; the whole box if it picks none.
+    """Smallest box around the corners of a mask, with a margin of a voxel; the whole box for an empty mask.
 
-    Too large a box wastes voxels on what is empty; in one that cuts something off, that is learnt as background.
+    Too large a box wastes voxels on empty space; a box that cuts something off turns it into background.
     """
     if not inside.any():
         return box.clone()
@@ -47,11 +47,12 @@ def tight_box(box: Box, inside: Bool[Tensor, "x y z"]) -> Box:
 
 
 class VoxelGrid(nn.Module):
-    """A row of channels at each corner of a box's voxels, zero at first, blended in between (see `kernels.dense_grid`).
+    """Channels at the corners of a box's voxels, initially zero, with trilinear interpolation (see
+    `kernels.dense_grid`).
 
-    values: (corner, channel), the last axis fastest; `size` says how many corners there are along each
-    finer: how many times as many voxels as a cube's there are along each axis; cubes at first
-    Coordinates beyond the box have the values of its faces.
+    values: (corner, channel), the last axis fastest; `size` is the number of corners along each
+    finer: ratio of voxels along each axis to those of cubes; initially cubes
+    Coordinates beyond the box are clamped.
     """
 
     grows: ClassVar[tuple[str, ...]] = ("values",)
@@ -74,12 +75,12 @@ class VoxelGrid(nn.Module):
 
     @property
     def edge(self) -> float:
-        """Length of a voxel, as a cube of its volume has it."""
+        """Edge of a cube with a voxel's volume."""
         return float(((self.box[1] - self.box[0]) / (self.size - 1)).prod() ** (1 / 3))
 
     @property
     def longest(self) -> float:
-        """Length of a voxel along the axis along which it is longest."""
+        """Longest edge of a voxel."""
         return float(((self.box[1] - self.box[0]) / (self.size - 1)).max())
 
     def forward(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample channel"]:
@@ -87,8 +88,8 @@ class VoxelGrid(nn.Module):
 
     @torch.no_grad()
     def rebuild(self, box: Box, voxels: int, optimizer: torch.optim.Optimizer | None = None) -> None:
-        """About so many voxels in a box within one's own, that blend as those before do. A new parameter takes the old
-        one's place; what an optimizer remembered of that is forgotten."""
+        """Resample to about `voxels` voxels in a box within the current one. The parameter is replaced; its optimizer
+        state is reset."""
         shape = self._shape(box, voxels)
         values = torch.cat([self(part) for part in corners(box, shape).split(CORNERS_PER_CHUNK)])
         self.size.copy_(torch.tensor(shape))
@@ -99,17 +100,17 @@ class VoxelGrid(nn.Module):
         return shape_of((box[1] - box[0]).cpu() * torch.tensor(self.finer, device="cpu"), voxels)
 
     def replace(self, values: Float[Tensor, "corner channel"], optimizer: torch.optim.Optimizer | None = None) -> None:
-        """Other values, of which there may be another number, as a new parameter; its moments begin at zero."""
+        """Replace the values, of any number, as a new parameter; its moments are zero."""
         exchange(self, "values", values, optimizer)
 
     def variation(
         self, coordinates: Float[Tensor, "sample 3"], count: int, generator: torch.Generator
     ) -> Float[Tensor, ""]:
-        """Total variation at the voxels of some samples, drawn at random; see `kernels.total_variation`.
+        """Total variation at the voxels of some random samples; see `kernels.total_variation`.
 
-        Only values that a step touches anyway get a gradient: an optimizer that scales gradients by their size would
-        move the others as far for smoothness alone.
-        count: samples to draw, of which one may come more than once
+        Only values with another gradient in the step get one: an optimizer that normalises gradients would move the
+        others as far for smoothness alone.
+        count: number of samples, with repetition
         """
         drawn = torch.randint(len(coordinates), (count,), generator=generator).to(coordinates.device)
         places = (coordinates[drawn] - self.box[0]) / (self.box[1] - self.box[0])

@@ -1,1 +1,1 @@
-"""Sampling along rays: spaces, samplers, empty space."""
+"""Sampling along rays: spaces, samplers, empty space skipping."""

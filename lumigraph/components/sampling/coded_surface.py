@@ -1,4 +1,4 @@
-"""CodedSurface: a SurfaceMethod in which a code means a shape: codes of members, and of a shape that is given."""
+"""CodedSurface: a SurfaceMethod with latent codes of shapes: of training members, and of a given shape."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Evidence = Literal["mesh", "half scan", "points", "picture"]
 
 
 class CodedSurface(SurfaceMethod):
-    """Learns from several shapes; `given` a further one, or evidence of it, it finds a code. Write `find`.
+    """Surface method trained on several shapes, which fits a code to a new one, or to evidence of it. Write `find`.
 
     codes:       of members
-    found:       code of the shape that was given, or drawn; no row without one
-    taken_kinds: kinds of evidence that it was made for
+    found:       code of the given or generated shape; no row without one
+    taken_kinds: accepted kinds of evidence
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Shapes,)
@@ -39,11 +39,11 @@ class CodedSurface(SurfaceMethod):
 
     @abstractmethod
     def find(self, evidence: Shape | Photograph) -> Float[Tensor, " code"]:
-        """The code of a shape of which this is known. It may change `frame`."""
+        """Fit a code to evidence of a shape. It may change `frame`."""
 
     @property
     def code(self) -> Float[Tensor, " code"]:
-        """Code of the instance that is shown; that of a single shape without a choice."""
+        """Code of the current instance; that of a single shape without a choice."""
         if len(self._instances) < 2:
             return self.codes.average
         others = {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
@@ -59,7 +59,7 @@ class CodedSurface(SurfaceMethod):
         return (*instance, *super().controls)
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same weights with the code of a shape of which a mesh, a scan or a picture is given."""
+        """The method with the code of a shape, fitted to its mesh, a scan or a picture."""
         taken = [piece for piece in evidence if isinstance(piece, self.takes)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.takes)), **controls)
         assert isinstance(told, CodedSurface)
@@ -73,7 +73,7 @@ class CodedSurface(SurfaceMethod):
         return told
 
     def drawn(self, seed: int) -> Method:
-        """A shape that nobody has modelled: a code from the Gaussian that fits the learnt ones."""
+        """The method with a generated shape: a code sampled from the Gaussian of the trained ones."""
         told = super().given()
         assert isinstance(told, CodedSurface)
         told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))

@@ -1,4 +1,4 @@
-"""Cone sampler: frustums of cones evenly along each ray, then where those found density (Barron 2021, section 3.2)."""
+"""Cone sampler: conical frustums uniformly along each ray, then by importance sampling (Barron 2021, section 3.2)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .sampling import inverse_transform, stratified
 
 
 class ConeSampler(HierarchicalSampler):
-    """Two passes of a `FrustumField`. Places along rays are edges of frustums; the second pass has its own.
+    """Two passes of a `FrustumField`. Positions along rays are edges of frustums; the second pass has its own.
 
     sampled_share: share of each ray, around `sampled_from`, that is sampled in training (Niemeyer 2022, eq. 10)
     sampled_from:  share of the way along each ray
@@ -51,8 +51,8 @@ def frustum_moments(
 
     start, end: distances from the apex
     radius:     of the cone at distance one
-    Barron 2021, eq. 7, in terms of the middle and the half-length: differences of high powers of start and end, as one
-    would first write it, lose all their digits where the frustum is thin.
+    Barron 2021, eq. 7, in terms of the middle and the half-length: the direct form, differences of high powers of start
+    and end, loses all digits for a thin frustum.
     """
     middle, half = 0.5 * (start + end), 0.5 * (end - start)
     both = (3 * middle.square() + half.square()).clamp_min(torch.finfo(middle.dtype).tiny)
@@ -65,7 +65,8 @@ def frustum_moments(
 def frustums_between(
     edges: Float[Tensor, "ray edge"], rays: Rays, space: Space
 ) -> tuple[Samples, Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
-    """Frustums between edges, which are shares of the way along each ray, and their means and variances in a space."""
+    """Frustums between edges, given as positions from 0 to 1 along each ray, and their means and variances in a
+    space."""
     with torch.no_grad():  # where samples lie tells nothing of a pose
         near, far = space.interval(rays)
         t = space.distance(edges, rays, near, far)
@@ -78,6 +79,6 @@ def frustums_between(
 
 
 def blurred(weights: Float[Tensor, "ray bin"]) -> Float[Tensor, "ray bin"]:
-    """Weights blurred a little, so that the fine samples surround what the coarse ones found (Barron 2021, eq. 17)."""
+    """Blurred weights, so that the fine samples surround the coarse ones of high weight (Barron 2021, eq. 17)."""
     larger = max_pool1d(pad(weights, (1, 1)), 2, 1)  # of each two neighbours
     return 0.5 * (larger[:, 1:] + larger[:, :-1])

@@ -1,4 +1,4 @@
-"""Hierarchical sampler: samples evenly along each ray, then more where those found density (Mildenhall 2020, 5.2)."""
+"""Hierarchical sampler: uniform samples along each ray, then importance sampling (Mildenhall 2020, 5.2)."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ class HierarchicalSampler(Sampler):
         return [coarse, fine]
 
     def coarse_shares(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "ray place"]:
-        """Places of the first pass, shares of the way along each ray."""
+        """Sample positions of the first pass, from 0 to 1 along each ray."""
         return stratified(len(rays), self.numbers.coarse_samples, generator, rays.origins.device)
 
     def fine_shares(
         self, shares: Tensor, weights: Float[Tensor, "ray sample"], generator: torch.Generator | None
     ) -> tuple[Tensor, Bool[Tensor, " all_samples"] | None]:
-        """Places of the second pass, and the samples that light reaches; None for all."""
+        """Sample positions of the second pass, and a mask of those before termination; None for all."""
         again = stratified(len(shares), self.numbers.fine_samples, generator, shares.device)
         again = inverse_transform(midpoints(shares), weights[:, 1:-1], again)
         both, order = torch.cat([shares, again], -1).sort(-1)
@@ -101,7 +101,7 @@ class HierarchicalSampler(Sampler):
         return both, lit.gather(-1, order).flatten()
 
     def places(self, shares: Tensor, rays: Rays) -> tuple[Samples, Places, Tensor | None]:
-        """Samples from each place to the next (eq. 3), what the field encodes of them, and their radius."""
+        """Samples from each position to the next (eq. 3), their input of the field, and their radius."""
         with torch.no_grad():  # the places of samples depend on no pose
             near, far = self.space.interval(rays)
             t = self.space.distance(shares, rays, near, far)
@@ -119,7 +119,7 @@ class HierarchicalSampler(Sampler):
         generator: torch.Generator | None = None,
         colours: bool = True,
     ) -> Pass:
-        """A field at places along rays. colours: evaluate them at once, of a field without a code"""
+        """Pass of a field at positions along rays. colours: evaluate them at once, for a field without a code"""
         samples, places, radius = self.places(shares, rays)
         if field.deforms:
             points, directions = samples.along(rays)

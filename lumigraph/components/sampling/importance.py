@@ -1,4 +1,4 @@
-"""Importance: how much of what is seen each number of a table has a share in (Li 2023, VQRF, eq. 4)."""
+"""Importance of a table's numbers: their share in rendered pictures (Li 2023, VQRF, eq. 4)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def importance(
     lookup: Callable[[Float[Tensor, "sample 3"]], Float[Tensor, "sample value"]],
     tables: list[Tensor],
 ) -> list[Tensor]:
-    """Sum over one picture's samples of their compositing weights, shared out to the numbers that each was looked up
-    from: sum_s w_s d(lookup(x_s)) / d(table), in absolute value. Shaped like the tables.
+    """Importance of a table's numbers in one picture: compositing weights, distributed over looked-up numbers,
+    sum_s w_s d(lookup(x_s)) / d(table), in absolute value. Shaped like the tables.
 
-    lookup: linear in each of the tables, of a stored grid for instance its trilinear interpolation: then a number's
-            share in a sample is its interpolation weight, and the lookup's own gradient adds all of them up
+    lookup: linear in each of the tables, e.g. trilinear interpolation of a grid: then a number's share in a sample is
+            its interpolation weight, and the lookup's own gradient sums all of them
     """
     rays = camera.rays(camera.pixels()).to(tables[0].device)
     totals = [torch.zeros_like(table) for table in tables]

@@ -8,7 +8,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def invert(edges, weights, shares, faint, found):
-    """Fill in `sampling.inverse_of`. faint: weight that every bin has at least"""
+    """Loop of `sampling.inverse_of`. faint: weight added to every bin"""
     bins = weights.shape[1]
     for ray in prange(len(weights)):
         total = 0.0
@@ -31,7 +31,7 @@ def invert(edges, weights, shares, faint, found):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def sum_excess(found, bins, edges, w, little, excess, slope):
-    """Fill in `proposal.excess_of` and its slope by what was found. little: weight that counts as none"""
+    """Loop of `proposal.excess_of` and its gradient. little: weight treated as zero"""
     count = found.shape[1]
     for ray in prange(len(w)):
         below = np.zeros(count + 1)

@@ -1,4 +1,4 @@
-"""Occupancy: a grid of density with which rays skip empty space, and space carving (Kutulakos and Seitz 2000)."""
+"""Occupancy grid for empty space skipping, and space carving (Kutulakos and Seitz 2000)."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ VIEWS = 24  # photographs asked at most: more cut little further
 
 @torch.no_grad()
 def visual_hull(scene: Scene, resolution: int, coarsest: int = 32) -> Bool[Tensor, "x y z"]:
-    """Cells of a grid over [-1, 1]^3 that no training photograph with alpha sees through, from coarse to fine.
+    """Visual hull: cells of a grid over [-1, 1]^3 inside all silhouettes of training photographs with alpha.
 
-    Conservative: a cell stays unless some photograph is transparent wherever the ball around the cell projects. All
-    stay of a capture that moves, where a photograph sees through cells that are full at another moment.
+    Conservative: a cell is removed only if some photograph is transparent over the whole projection of its bounding
+    ball. All stay in a dynamic capture, where cells may be occupied at another time.
     """
     if scene.frame.times is not None:
         return torch.ones(resolution, resolution, resolution, dtype=torch.bool)
@@ -55,7 +55,7 @@ def visual_hull(scene: Scene, resolution: int, coarsest: int = 32) -> Bool[Tenso
 def _seen_through(
     camera: Camera, alpha: Float[Tensor, "height width"], centres: Float[Tensor, "cell 3"], radius: float
 ) -> Bool[Tensor, " cell"]:
-    """Mask of balls around whose projection all pixels are transparent; False for balls outside the picture."""
+    """Mask of balls with completely transparent projections; False for balls outside the picture."""
     if not len(centres):
         return torch.zeros(0, dtype=torch.bool)
     height, width = alpha.shape
@@ -72,11 +72,12 @@ def _seen_through(
 
 
 class OccupancyGrid(nn.Module):
-    """Cubes of n^3 cells around the origin, each twice as large as the last (Müller 2022, appendix E.2).
+    """Occupancy grid in cascades: cubes of n^3 cells around the origin, each twice as large as the last (Müller 2022,
+    appendix E.2).
 
-    density:  the most that was seen lately in each cell, per scene unit: a maximum that decays
-    occupied: the cells worth visiting
-    It begins coarse, where a few thousand looks tell what is empty, and `refine` halves its cells.
+    density:  decaying maximum of the density in each cell, per scene unit
+    occupied: mask of occupied cells
+    It begins coarse, where a few thousand samples find empty space, and `refine` halves its cells.
     """
 
     grows: ClassVar[tuple[str, ...]] = ("density", "occupied", "possible")
@@ -96,12 +97,12 @@ class OccupancyGrid(nn.Module):
 
     @staticmethod
     def cascades_of(reach: float) -> int:
-        """Grids for a scene of a reach."""
+        """Number of cascades for a scene's reach."""
         return 1 + max(0, math.ceil(math.log2(reach)))
 
     @classmethod
     def bytes_of(cls, reach: float, resolution: int) -> int:
-        """Bytes of a grid refined to a resolution: a density and two marks for each cell."""
+        """Bytes of a grid at its final resolution: a density and two masks for each cell."""
         return cls.cascades_of(reach) * resolution**3 * (4 + 1 + 1)
 
     @property
@@ -122,7 +123,7 @@ class OccupancyGrid(nn.Module):
             setattr(self, name, grid)
 
     def rule_out(self, possible: Bool[Tensor, "cascade x y z"]) -> None:
-        """Mark cells as empty for good, whatever the field's density there; their grid sets the resolution."""
+        """Mark cells as permanently empty, whatever the field's density there; their grid sets the resolution."""
         self.possible = possible.to(self.density.device)
         self.occupied, self.density = self.possible.clone(), torch.zeros_like(self.possible, dtype=torch.float32)
         self.box.copy_(self._box())
@@ -136,9 +137,9 @@ class OccupancyGrid(nn.Module):
         stop: float = 0.0,
         jitter: Float[Tensor, " ray"] | None = None,
     ) -> Samples:
-        """Samples in occupied cells, until the grid's own density has used up the light (see `kernels.march`).
+        """Samples in occupied cells, with early termination by the grid's own density (see `kernels.march`).
 
-        jitter: in [0, 1), moves each ray's lattice by that share of a step
+        jitter: in [0, 1), shifts each ray's lattice by that share of a step
         """
         enter, leave = rays.through_box(self.box)
         # Whole steps from the near distance, so that the lattice does not follow the box.
@@ -159,12 +160,11 @@ class OccupancyGrid(nn.Module):
         share: float = 1.0,
         budget: int | None = None,
     ) -> None:
-        """Ask for the density at one random point in each of some cells, and decide anew which are occupied.
+        """Update densities at one random point in each of some cells, and threshold them again.
 
-        thickness: optical thickness across a cell from which on it is occupied; or the density's mean over all cells,
-                   where that is less
-        share:     below 1, only the occupied cells and that share of all cells, drawn at random, are looked at
-        budget:    looks at most, half of them at occupied cells; cells then take turns
+        thickness: optical thickness across an occupied cell, at least, or the mean density of all cells if less
+        share:     below 1, only occupied cells and that share of all cells, at random, are updated
+        budget:    largest number of evaluations, half of them in occupied cells; cells then take turns
         """
         flat = self.density.view(-1)
         cells = self._choose(share, budget, generator)
@@ -198,7 +198,7 @@ class OccupancyGrid(nn.Module):
         return ((index + inside) * (2 / n) - 1) * half[:, None]
 
     def _box(self) -> Float[Tensor, "2 3"]:
-        """The corners of the smallest box around all occupied cells."""
+        """Corners of the bounding box of all occupied cells."""
         low, high = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
         for cascade, occupied in enumerate(self.occupied.cpu()):
             half = 2.0**cascade
@@ -226,10 +226,10 @@ class MaskNumbers:
 
 
 class OccupancyMask(Part):
-    """A grid over the cube of coordinates, [-1, 1]^3, that remembers where a network found something.
+    """Occupancy mask over the cube of coordinates, [-1, 1]^3, for a coordinate network.
 
-    cells:     along each axis; the hull of an object may make them finer. 0: no grid, something may be anywhere
-    thickness: optical thickness across a cell below which it is empty
+    cells:     along each axis; the hull of an object may refine them. 0: no mask
+    thickness: optical thickness across an empty cell, at most
     """
 
     known: Tensor
@@ -243,18 +243,18 @@ class OccupancyMask(Part):
             self._coarser: tuple[Tensor, dict[int, Tensor]] = self.grid.occupied, {}
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Mark as empty for good the cells that photographs of an object see through, unless poses are learnt:
-        silhouettes seen from wrong poses would carve what is there."""
+        """Mark the cells outside the visual hull of an object as permanently empty, unless poses are optimised:
+        silhouettes with wrong poses would carve the object."""
         if self.cells and data.images.has_alpha and not data.frame.is_open and not method.moves_cameras:
             self.grid.rule_out(visual_hull(data, self.cells)[None])
 
     def begin_from(self, teacher: Any, space: Space, chance: torch.Generator) -> None:
-        """Mark as empty for good the cells in which a teacher holds nothing."""
+        """Mark the cells that are empty in a teacher as permanently empty."""
         if self.cells:
             self.grid.rule_out(teacher.occupied(space, self.cells, self.thickness, chance)[None])
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        """Update the grid every EVERY steps, by the density of the method's `CoordinateField`."""
+        """Update the mask every EVERY steps, by the density of the method's `CoordinateField`."""
         if not self.cells or progress < BEGINS or step % EVERY:
             return
         share, looks = (PROBES, LOOKS) if self.known else (1.0, None)  # everywhere for once
@@ -264,7 +264,7 @@ class OccupancyMask(Part):
     def may_hold(
         self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None
     ) -> Bool[Tensor, " sample"] | None:
-        """Mask of places with something within a radius; None without a grid. The nearest cell counts beyond it."""
+        """Mask of coordinates with an occupied cell within a radius; None without a mask. Clamped to the grid."""
         if not self.cells:
             return None
         if radius is None:
@@ -277,7 +277,7 @@ class OccupancyMask(Part):
         return found
 
     def _neighbourhood(self, level: int) -> Bool[Tensor, " cell"]:
-        """Cells 2^level times as large that hold something themselves or beside them; kept until the grid changes."""
+        """Occupied cells 2^level times as large, dilated by one; cached until the mask changes."""
         if self._coarser[0] is not self.grid.occupied:
             self._coarser = self.grid.occupied, {}
         kept = self._coarser[1]

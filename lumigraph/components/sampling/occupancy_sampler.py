@@ -1,4 +1,4 @@
-"""Occupancy sampler: samples lie in occupied cells of a grid, as far as light reaches (Müller 2022, appendix E)."""
+"""Occupancy sampler: samples in occupied cells of a grid, with early termination (Müller 2022, appendix E)."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class OccupancyNumbers:
 
 @dataclass(frozen=True)
 class StepNumbers:
-    """A Config's numbers of the steps along a ray, where no grid of a field sets them (Müller 2022, appendix E.1)."""
+    """A Config's numbers of the steps along a ray, for fields without a grid (Müller 2022, appendix E.1)."""
 
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the diagonal, E.1; fewer are faster
     cone_angle: Share = 1 / 256  # growth of the step with distance, appendix E.1; higher: fewer samples far away
 
 
 class Stage(NamedTuple):
-    """From a share of the budget on: shares of `occupancy_resolution` and of `steps_per_diagonal`."""
+    """Stage of a schedule from a share of the budget on: factors on `occupancy_resolution` and `steps_per_diagonal`."""
 
     begins: float
     cells: float
@@ -63,10 +63,10 @@ class Stage(NamedTuple):
 
 @dataclass(frozen=True)
 class GridSchedule:
-    """The updates of an occupancy grid over the budget.
+    """Schedule of an occupancy grid's updates.
 
     stages:      resolution of the grid and of the steps along rays, from coarse to fine
-    begins:      share of the budget before which nothing is known to be empty
+    begins:      share of the budget before which no cell is empty
     early_steps: steps in which the whole grid is updated, every EARLY_INTERVAL steps
     probes:      share of all cells, drawn at random, that an update visits besides occupied ones; 1 for all cells
     max_cells:   cells that an update visits at most; None for CELLS_PER_SAMPLE of each sample
@@ -93,15 +93,15 @@ NGP_SCHEDULE = GridSchedule(
 
 
 class OccupancySampler(Sampler):
-    """Samples in occupied cells. A first pass without gradients finds those that light reaches; the field is evaluated
-    with gradients at these alone, because most samples lie behind what their ray sees.
+    """Samples in occupied cells. A first pass without gradients applies early termination; the field is evaluated with
+    gradients only at the remaining samples, because most are occluded.
 
     numbers, schedule: of the grid
-    steps:             lengths of steps along rays; None where the field's own grid sets them
-    samples_per_ray:   samples of a typical ray once empty space is known
-    max_rays:          rays of a step at most
-    adapts:            whether the number of rays follows the number of samples they need
-    sampled_share:     share of each ray, around its middle, that is sampled in training
+    steps:             lengths of steps along rays; None for those of the field's own grid
+    samples_per_ray:   samples of a typical ray after empty space is known
+    max_rays:          largest number of rays of a step
+    adapts:            whether the number of rays adapts to the number of samples per ray
+    sampled_share:     share of each ray, around its middle, sampled in training
     """
 
     rays_per_step: Tensor
@@ -161,7 +161,7 @@ class OccupancySampler(Sampler):
         return [Pass("samples", samples, density, features, directions, coloured, evaluated=evaluated)]
 
     def _visible(self, rays: Rays, found: Samples, field: Field, code: RayCodes | None) -> Pass:
-        """A pass for pictures: geometry is evaluated once, from the front until a ray terminates. Samples of at most
+        """A pass for rendering: geometry is evaluated once, front to back until a ray terminates. Samples of at most
         MIN_WEIGHT are left out, so those behind them get that weight."""
         points, directions = found.along(rays)
         codes = None if code is None else codes_at(found.ray_index, code)
@@ -208,7 +208,7 @@ class OccupancySampler(Sampler):
     # Training
 
     def begin(self, method: Any, data: Any, seconds: float) -> None:
-        """Rule out cells that the photographs' alpha proves empty, unless poses are learnt."""
+        """Mark the cells outside the visual hull as empty, unless poses are optimised."""
         if isinstance(data, Scene) and data.images.has_alpha and not self.frame.is_open and not method.moves_cameras:
             self.grid.rule_out(visual_hull(data, self.numbers.occupancy_resolution)[None])
 
@@ -226,7 +226,7 @@ class OccupancySampler(Sampler):
             setattr(self.grid, name, getattr(self.grid, name)[:, :1, :1, :1].clone())
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        """Refine the grid when its stage begins, and update it when that is due (appendix E.2)."""
+        """Refine the grid when its next stage begins, and update it when due (appendix E.2)."""
         n, schedule = self.numbers, self.schedule
         stage = schedule.stage(progress)
         self.step_share = stage.steps
@@ -249,15 +249,15 @@ class OccupancySampler(Sampler):
         return self.schedule.max_cells or self.numbers.samples_per_step * CELLS_PER_SAMPLE
 
     def after_step(self, method: Any, step: int) -> None:
-        """Set the next step's number of rays so that it evaluates about `samples_per_step` samples: steps then take the
-        same time and memory however many samples a ray needs (section 5.4)."""
+        """Set the next step's number of rays to evaluate about `samples_per_step` samples, for constant time and memory
+        of steps (section 5.4)."""
         if self.adapts:
             wanted, rays = self.numbers.samples_per_step, int(self.rays_per_step)
             count = min(max(rays * wanted / max(self.evaluated, 1), MIN_RAYS), MAX_GROWTH * rays, wanted)
             self.rays_per_step.fill_(min(int(count), self.max_rays))
 
     def storage(self) -> dict[str, Stored]:
-        """Rendering needs the marks of occupied cells alone."""
+        """Storage: rendering needs only the mask of occupied cells."""
         return {"grid.density": Stored("nothing"), "grid.possible": Stored("nothing", fill=1.0)}
 
 
@@ -265,10 +265,10 @@ class OccupancySampler(Sampler):
 def reached(
     rays: Rays, found: Samples, field: Field, code: Float[Tensor, "ray code"] | None, stop: float
 ) -> tuple[Samples, int]:
-    """The samples that light reaches, and the number at which density was evaluated for that, without gradients.
+    """Samples before termination, and the number of density evaluations for that, without gradients.
 
-    A field with cheap density is evaluated at all samples at once, and those of no more than its least weight are left
-    out. Others are evaluated along each ray from the front until it terminates (see `volume.visible_weights`).
+    A field with cheap density is evaluated at all samples at once, and those of at most its least weight are left
+    out. Others are evaluated along each ray front to back until it terminates (see `volume.visible_weights`).
     stop: transmittance at which a ray terminates
     """
     points, _ = found.along(rays)
@@ -288,14 +288,14 @@ def reached(
 
 
 def joined(parts: list[Features]) -> Features:
-    """Features of several sets of points one after the other, laid out as `rows_of` has them."""
+    """Concatenate features of sets of points, in the layout of `rows_of`."""
     if isinstance(parts[0], tuple):
         return tuple(torch.cat([x.t() for x in each], 1).t() for each in zip(*parts, strict=True))
     return torch.cat([x.t() for x in parts if isinstance(x, Tensor)], 1).t()
 
 
 def rows_of(features: Features, rows: Int[Tensor, " row"]) -> Features:
-    """Some rows of features. In memory one feature of all rows follows another, as networks give and read them."""
+    """Some rows of features, in feature-major layout, as networks return and read them."""
     if isinstance(features, tuple):
         return tuple(x.t().index_select(1, rows).t() for x in features)
     return features.t().index_select(1, rows).t()

@@ -1,4 +1,4 @@
-"""Proposals: a coarse grid of density says where along a ray a field is worth asking (Barron 2022, section 3.1)."""
+"""Proposal grid: a coarse density grid that places a field's samples (Barron 2022, section 3.1)."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ SPARE = 0.01  # share of samples that lie anywhere, however little was found the
 class Proposed:
     """Proposals for a batch of rays.
 
-    samples: intervals to ask a field about, as many on each ray
-    edges:   where they begin and end, as shares of the way from near to far
+    samples: intervals for the field, as many on each ray
+    edges:   of these intervals, as positions from 0 to 1 between near and far
     bins:    edges of the grid's own intervals, in the same unit
-    weights: that the grid finds in those
+    weights: of the grid in those
     """
 
     samples: Samples
@@ -42,10 +42,10 @@ class Proposed:
 
 
 class Proposal(nn.Module):
-    """A voxel grid over a space's coordinates that learns to find at least the weights that a field finds.
+    """A voxel grid over a space's coordinates, trained to bound the field's weights from above.
 
-    Each ray is looked at everywhere, a lookup at a time, and then where something was found. So a ray costs the same in
-    fog and in clear air, and what no photograph has contradicted yet is never out of reach.
+    Each ray is sampled everywhere in the grid, and then in the field where the grid has weight. So a ray costs the same
+    in fog and in clear air, and regions not yet contradicted by a photograph stay reachable.
     """
 
     def __init__(self, space: Space, cells: int, bins: int, count: int):
@@ -56,14 +56,14 @@ class Proposal(nn.Module):
         self.sharpness = 1.0
 
     def anneal(self, progress: float) -> None:
-        """Begin with samples nearly everywhere, where nothing is known yet. progress: share of the budget spent"""
+        """Anneal from nearly uniform sampling. progress: spent share of the budget"""
         share = min(1.0, progress / SHARP)
         self.sharpness = SLOPE * share / ((SLOPE - 1) * share + 1)
 
     def sample(self, rays: Rays, jitter: Float[Tensor, "ray 2"] | None = None) -> Proposed:
-        """Intervals for a field, with gradients to the grid in the weights alone.
+        """Intervals for a field, differentiable in the grid through the weights alone.
 
-        jitter: in [0, 1), moves each ray's intervals, the grid's and the field's, by that share of one
+        jitter: in [0, 1), shifts each ray's intervals, the grid's and the field's, by that share of one
         """
         rays = replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
         near, far = self.space.interval(rays)
@@ -96,7 +96,7 @@ class Proposal(nn.Module):
 
     @torch.no_grad()
     def begin(self, points: Float[Tensor, "point 3"]) -> None:
-        """Expect something where points are known, and little elsewhere."""
+        """Initialise with density near known points, and little elsewhere."""
         grid, (x, y, z) = self.grid, self.grid.shape
         size = grid.size.to(points.device) - 1
         index = ((self.space.warp(points) + 1) / 2 * size).clamp(min=0)
@@ -115,7 +115,8 @@ class Proposal(nn.Module):
         return Samples.rows(t[:, :-1], t[:, -1])
 
     def _distance(self, shares: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
-        """Even in normalised device coordinates; elsewhere within a unit of the camera, and in disparity beyond."""
+        """Distances linear in normalised device coordinates, or linear within a unit of the camera and in disparity
+        beyond."""
         if isinstance(self.space, NDC):
             return self.space.distance(shares, rays, near, far)
         first, last = (torch.where(t < 1, t, 2 - 1 / t.clamp_min(1))[:, None] for t in (near, far))
@@ -124,15 +125,14 @@ class Proposal(nn.Module):
 
 
 def edges_of(count: int, jitter: Float[Tensor, " ray"]) -> Float[Tensor, "ray edge"]:
-    """Edges of `count` intervals of [0, 1], all but the first and last moved by jitter - 1/2 of one."""
+    """Edges of `count` intervals of [0, 1], all but the first and last shifted by jitter - 1/2 of one."""
     inner = torch.arange(1, count, device=jitter.device) + (jitter[:, None] - 0.5)
     return nn.functional.pad(nn.functional.pad(inner / count, (1, 0)), (0, 1), value=1.0)
 
 
 def proposal_loss(proposed: Proposed, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
-    """By how much a field's weights exceed what the grid finds in all its intervals that they overlap, mean of all rays
-    (Barron 2022, eqs. 12 and 13). Gradients reach the grid alone.
-    """
+    """Proposal loss: excess of the field's weights over the grid's weights in overlapping intervals, mean of all rays
+    (Barron 2022, eqs. 12 and 13). Gradients reach the grid alone."""
     w = weights.detach().view(len(proposed.edges), -1)
     excess = _Excess.apply if loops_fit(w) else excess_of
     return excess(proposed.weights, proposed.bins, proposed.edges, w).mean()
@@ -144,8 +144,8 @@ def excess_of(
     edges: Float[Tensor, "ray edge"],
     w: Float[Tensor, "ray interval"],
 ) -> Float[Tensor, " ray"]:
-    """sum_i max(0, w_i - bound_i)^2 / w_i of each ray, where bound_i sums the weights found in bins that interval i
-    overlaps (Barron 2022, eq. 13)."""
+    """sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with bound_i the sum of the grid's weights in bins that overlap
+    interval i (Barron 2022, eq. 13)."""
     below = nn.functional.pad(found.cumsum(-1), (1, 0))
     first = torch.searchsorted(bins, edges[:, :-1].contiguous(), right=True) - 1
     last = torch.searchsorted(bins, edges[:, 1:].contiguous()).clamp(max=bins.shape[1] - 1)

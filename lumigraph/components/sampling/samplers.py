@@ -1,9 +1,9 @@
-"""Samplers: the choice between an occupancy grid and proposals by the space, and the proposal sampler.
+"""Samplers: the choice between occupancy grid and proposals by the space, and the proposal sampler.
 
-Proposals: samples along rays without an end, where a grid of density proposes (Barron 2022, section 3.1). Every ray
-gets the same number of samples. Terms of the loss keep the air clear: the distortion loss (Barron 2022, eq. 15),
-gradients scaled near cameras (Philip 2023), and at first depth from plane sweeps over neighbouring photographs with
-clear air between cameras.
+Proposals: samples along unbounded rays, by a proposal grid of density (Barron 2022, section 3.1). Every ray gets the
+same number of samples. Loss terms keep the air clear: the distortion loss (Barron 2022, eq. 15), gradients scaled near
+cameras (Philip 2023), and initially depth from plane sweeps over neighbouring photographs with clear air between
+cameras.
 """
 
 from __future__ import annotations
@@ -63,21 +63,21 @@ RAYS_PER_CHUNK = 4096  # rendered at once: the activations of their samples fit 
 
 @dataclass(frozen=True)
 class ProposalNumbers:
-    """A Config's numbers of the proposal sampler, for scenes without bounds."""
+    """A Config's numbers of the proposal sampler, for unbounded scenes."""
 
     sweep_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
-        """Bytes of the proposal grid, with its gradient and moments while it learns."""
+        """Bytes of the proposal grid, in training with its gradient and moments."""
         return 4 * CELLS**3 * (4 if learning else 1) * frame.is_open
 
 
 class ProposalSampler(Sampler):
-    """Samples where a proposal grid finds density.
+    """Samples by a proposal grid of density.
 
-    surface, surface_from: points on surfaces, and the camera position that each was found from
+    surface, surface_from: points on surfaces, and each one's camera position
     stands:                those positions, each once
-    progress:              share of the budget spent
+    progress:              spent share of the budget
     """
 
     is_open: ClassVar[bool] = True
@@ -120,7 +120,7 @@ class ProposalSampler(Sampler):
         return [Pass("samples", samples, density, features, directions, None, rgb, count, scale, proposals)]
 
     def _visible(self, rays: Rays, field: Field, code: Float[Tensor, "ray code"] | None) -> Pass:
-        """A pass for pictures: samples of at most MIN_WEIGHT are left out, so those behind them get that weight."""
+        """A pass for rendering: samples of at most MIN_WEIGHT are left out, so those behind them get that weight."""
         samples = self.proposal.places(rays)
         points, directions = samples.along(rays)
         own = codes_at(samples.ray_index, code) if code is not None and field.deforms else None
@@ -132,8 +132,8 @@ class ProposalSampler(Sampler):
         return Pass("samples", seen, density.index_select(0, rows), features, directions, evaluated=count)
 
     def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
-        """The proposal loss, the distortion loss, and where surfaces are known the depth loss of some more rays and the
-        share of light that air between cameras stops."""
+        """Proposal loss, distortion loss, and with known surfaces the depth loss of additional rays and the opacity of
+        air between cameras."""
         weights = weights_of(last.samples, last.density)
         terms = {"proposal": proposal_loss(last.proposals, weights)}
         terms["distortion"] = DISTORTION_WEIGHT * distortion_loss(last.samples, weights)
@@ -151,9 +151,9 @@ class ProposalSampler(Sampler):
     def _depth_error(
         self, density_at: Density, origins: Places, ways: Places, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """`depth_loss` of rays to surfaces, and the proposal loss of these.
+        """`depth_loss` of rays to surfaces, and their proposal loss.
 
-        They begin between two cameras: air that is clear along the rays of photographs alone may be fog from beside.
+        Origins are between two cameras: air that is clear along the photographs' rays may be fog from the side.
         """
         distance = ways.norm(dim=-1)
         rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
@@ -166,8 +166,8 @@ class ProposalSampler(Sampler):
     def _stopped_by_air(
         self, density_at: Density, origins: Places, ways: Places, generator: torch.Generator
     ) -> Float[Tensor, ""]:
-        """Share of light that is stopped half way from between cameras to the nearest surface, around the ways to
-        surfaces; by the density at one random place of each ray."""
+        """Opacity of the air half way from between cameras to the nearest surface, around the directions to surfaces;
+        from the density at one random position of each ray."""
         some = torch.randint(len(self.surface), (NEAREST_OF,), generator=generator).to(self.surface.device)
         nearest = torch.cdist(origins, self.surface[some]).quantile(OUTLIERS, dim=1)
         aside = CONE * torch.randn(ways.shape, generator=generator).to(ways)
@@ -190,7 +190,7 @@ class ProposalSampler(Sampler):
         compile_sweep()
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Find points on surfaces by plane sweeps, unless poses are learnt."""
+        """Find points on surfaces by plane sweeps, unless poses are optimised."""
         if not self.numbers.sweep_weight or method.moves_cameras:
             return
         found = some(seen_points(data, SWEEP_SHARE * seconds), method.random(1))
@@ -217,7 +217,7 @@ class ProposalSampler(Sampler):
         return {"proposal": falling(*LEARNING_RATES, progress)}
 
     def storage(self) -> dict[str, Stored]:
-        """Rendering needs the grid of proposals alone."""
+        """Storage: rendering needs only the proposal grid."""
         return {"proposal.grid.values": Stored("half"), "surface": Stored("nothing"), "surface_from": Stored("nothing")}
 
 
@@ -226,7 +226,7 @@ def _scaled(t: Float[Tensor, " sample"], values: Float[Tensor, "sample _"]) -> F
 
 
 def some(points: Points, generator: torch.Generator) -> Points:
-    """At most MAX_POINTS of points, drawn at random."""
+    """A random subset of at most MAX_POINTS points."""
     if len(points.positions) <= MAX_POINTS:
         return points
     chosen = torch.randperm(len(points.positions), generator=generator)[:MAX_POINTS]
@@ -252,10 +252,10 @@ def sampler_for(
     max_rays: int | None = None,
     **bounded: Any,
 ) -> Sampler:
-    """A sampler that suits a space.
+    """Sampler for a space.
 
-    open_samples: samples of a step in a scene without bounds; None for as many as in others
-    max_rays:     rays of a step at most
+    open_samples: samples of a step in an unbounded scene; None for as many as in others
+    max_rays:     largest number of rays of a step
     bounded:      further arguments of an `OccupancySampler`
     """
     if space.is_open:

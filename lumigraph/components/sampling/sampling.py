@@ -1,4 +1,4 @@
-"""Places of samples along a ray: stratified, and by inverse transform of the weights of earlier ones."""
+"""Sample positions along a ray: stratified, and by inverse transform of earlier weights."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ FAINT = 1e-5  # weight that every bin has at least, so that no part of a ray is 
 def stratified(
     rays: int, count: int, generator: torch.Generator | None = None, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "ray {count}"]:
-    """One number in each of `count` even bins of [0, 1], growing (Mildenhall 2020, eq. 2).
+    """One number in each of `count` equal bins of [0, 1], ascending (Mildenhall 2020, eq. 2).
 
-    generator: draws each bin's place; None takes the middles
+    generator: samples within bins; None takes their centres
     """
     if generator is None:
         offset = torch.full((rays, count), 0.5, device=device)
@@ -28,11 +28,11 @@ def stratified(
 def inverse_transform(
     edges: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], shares: Float[Tensor, "ray count"]
 ) -> Float[Tensor, "ray count"]:
-    """Numbers spread like a piecewise constant density: its inverse cumulative distribution (Mildenhall 2020, eq. 5).
+    """Inverse transform sampling of a piecewise constant density (Mildenhall 2020, eq. 5).
 
-    edges:   of the bins, growing, one more than there are bins
+    edges:   of the bins, ascending, one more than there are bins
     weights: of each bin, not negative
-    shares:  in [0, 1], growing, how much of the distribution lies below each result; see `stratified`
+    shares:  in [0, 1], ascending, values of the cumulative distribution; see `stratified`
     """
     if loops_fit(edges, weights, shares):
         found = torch.empty_like(shares, memory_format=torch.contiguous_format)
@@ -44,7 +44,7 @@ def inverse_transform(
 def inverse_of(
     edges: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], shares: Float[Tensor, "ray count"]
 ) -> Float[Tensor, "ray count"]:
-    """The definition of `inverse_transform`, on any device and with gradients."""
+    """Reference implementation of `inverse_transform`, on any device and with gradients."""
     density = weights + FAINT
     below = torch.nn.functional.pad((density / density.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     i = torch.searchsorted(below, shares.contiguous(), right=True).clamp(1, weights.shape[-1])
@@ -54,7 +54,7 @@ def inverse_of(
 
 
 def loops_fit(*tensors: Tensor) -> bool:
-    """True for tensors that loops on the CPU take: float32, and no gradient is asked for."""
+    """True for tensors supported by CPU loops: float32, without gradients."""
     wanted = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
     return not wanted and all(x.dtype == torch.float32 and not x.is_cuda for x in tensors)
 

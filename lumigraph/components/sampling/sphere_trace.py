@@ -1,4 +1,4 @@
-"""Sphere tracing (Hart 1996): first crossings of rays with the zero level of a function, differentiable there."""
+"""Sphere tracing (Hart 1996): first intersections of rays with the zero level of a function, differentiable."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MIN_COSINE = 0.02  # between ray and normal at which the slope of the function a
 
 @dataclass(frozen=True)
 class March:
-    """Numbers of a march along rays, in scene units.
+    """Parameters of ray marching, in scene units.
 
     max_steps:   evaluations of the function along one ray
-    min_step:    shortest step; what is thinner along the ray may be missed
-    max_step:    longest step, for functions that are no distances. With `min_step` it gives even steps
-    step_scale:  share of the value to step; below 1 for a function whose slope exceeds 1
-    refinements: evaluations that narrow a crossing down (regula falsi)
+    min_step:    shortest step; thinner objects may be missed
+    max_step:    longest step, for functions that are no distances. With `min_step` it gives equal steps
+    step_scale:  share of the value to step; below 1 for a function with a slope above 1
+    refinements: evaluations that refine a crossing (regula falsi)
     """
 
     max_steps: int = 128
@@ -37,11 +37,11 @@ class March:
 
 @dataclass(frozen=True)
 class Crossings:
-    """First crossing of each ray.
+    """First intersection of each ray.
 
-    t:       distance along the ray, infinity without a crossing
-    hit:     rays that cross from positive to negative inside the box, or are negative where they enter it
-    closest: distance along the ray of the least value that was met, also for rays without a crossing
+    t:       distance along the ray, infinity without one
+    hit:     rays that cross from positive to negative inside the box, or are negative at their entry
+    closest: distance along the ray of the least value, also for rays without an intersection
     """
 
     t: Float[Tensor, " ray"]
@@ -52,14 +52,14 @@ class Crossings:
 def sphere_trace(
     distance: Distance, rays: Rays, box: Float[Tensor, "2 3"], march: March | None = None, near: float = 0.0
 ) -> Crossings:
-    """First crossings of rays with distance(x) = 0 in a box.
+    """First intersections of rays with distance(x) = 0 in a box.
 
-    Rays that are done leave the batch. Where gradients are enabled, `t` is differentiable in the rays and in all that
+    Finished rays leave the batch. With gradients enabled, `t` is differentiable in the rays and in everything that
     `distance` depends on, by implicit differentiation (Niemeyer 2020, eq. 10; Yariv 2020, eq. 3):
 
-        dt = -df / (grad f . d)     at the crossing, grad f and d constant
+        dt = -df / (grad f . d)     at the intersection, grad f and d constant
 
-    near: distance along rays at which they begin
+    near: start of rays, as distance
     """
     with torch.no_grad():
         t, hit, inside, closest = _first_crossings(distance, rays, box, march or March(), near)
@@ -71,7 +71,7 @@ def sphere_trace(
 def _first_crossings(
     distance: Distance, rays: Rays, box: Float[Tensor, "2 3"], march: March, near: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Distance, hit, hit where the ray begins, and distance of the least value, of each ray."""
+    """Distance, hit, hit at the start, and distance of the least value, of each ray."""
     enter, leave = rays.through_box(box)
     enter = enter.clamp_min(near)
     t, closest = torch.full_like(enter, torch.inf), enter.clone()

@@ -22,7 +22,8 @@ AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface
 
 
 class SurfaceMethod(RayMethod):
-    """Learns from Shapes. Write `distance`, negative inside; pictures have colour, depth, opacity and normals.
+    """Surface method trained on Shapes. Write `distance`, negative inside; pictures have colour, depth, opacity and
+    normals.
 
     march:    steps along rays towards the surface
     shadings: choices of the control of that name, the default first
@@ -38,8 +39,8 @@ class SurfaceMethod(RayMethod):
         """A function of points in scene units that is zero at the surface and negative inside."""
 
     def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
-        """Distance at which each ray meets the surface inside the box of interest, infinity where it does not, and the
-        unit normal there, zero where it does not."""
+        """Distance of each ray's intersection with the surface inside the box of interest, infinity for none, and the
+        unit normal there, zero for none."""
         box = torch.tensor(self.frame.bounds, device=self.device)
         return self.with_normals(rays, sphere_trace(self.distance, rays, box, self.march, self.frame.near).t)
 

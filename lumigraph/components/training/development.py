@@ -1,4 +1,4 @@
-"""Linear light becomes a picture: exposure, white balance and tone, as a raw converter's sliders have them."""
+"""Development of linear light: exposure, white balance and tone curve, as in a raw converter."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ CONTROLS = (
 
 
 def exposed(light: Light, stops: float, kelvin: float) -> Light:
-    """Linear sRGB, brighter by as many stops, with the light of a temperature shown as white."""
+    """Linear sRGB, brighter by as many stops, white-balanced for a colour temperature."""
     gains = white(DAYLIGHT) / white(kelvin)
     return light * (2**stops * gains).to(light)
 
 
 def toned(light: Light, curve: str) -> Light:
-    """Linear light as the encoded colours of a picture, in [0, 1]."""
+    """Linear light as encoded colours of a picture, in [0, 1], by a tone curve."""
     if curve == "linear":
         return light.clamp(0, 1)
     return encoded(filmic(light) if curve == "filmic" else light.clamp(0, 1))
@@ -52,7 +52,7 @@ def decoded(rgb: Light) -> Light:
 
 
 def filmic(light: Light) -> Light:
-    """A film's response: a toe, and a shoulder that never ends (Narkowicz 2015, a fit of ACES)."""
+    """Filmic tone curve: a toe and an asymptotic shoulder (Narkowicz 2015, a fit of ACES)."""
     x = 0.6 * light.clamp_min(0)
     return (x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)).clamp(0, 1)
 

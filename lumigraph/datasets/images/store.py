@@ -228,7 +228,7 @@ class ImageStore:
 
     @property
     def trusted_pixels(self) -> Int[Tensor, " image"]:
-        """Number of pixels of each image to learn from."""
+        """Number of trainable pixels of each image."""
         return self._count
 
     def order(self, index: int) -> Int[np.ndarray, " pixel"] | None:

@@ -228,7 +228,7 @@ def folder_bytes(folder: Path) -> int:
 
 
 def told(size: float) -> str:
-    """Bytes for people, to three digits, as --to takes them."""
+    """Bytes as text, to three digits, in the format of --to."""
     return f"{size / 1e6:.3g}MB" if size >= 1e6 else f"{size / 1e3:.3g}kB"
 
 

@@ -108,8 +108,8 @@ def texture_of(
     panorama: Camera,
     texels: int,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Colours of the first layer, looked up in the photographs, so many texels along each side of a pixel; below them
-    those of the second one."""
+    """Texture of the first layer, interpolated in the photographs, at a number of texels along each side of a pixel;
+    below it that of the second layer."""
     fine = panorama.resized(texels)
     rows, columns = (int(x) for x in fine.size[0].flip(0))
     depth = interpolate(front.depth[None, None], (rows, columns), mode="nearest")[0, 0]

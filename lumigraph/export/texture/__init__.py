@@ -69,7 +69,7 @@ def textured(
 
 
 def check_room(size: int) -> None:
-    """Raises LumigraphError where a texture of so many texels a side does not fit into memory."""
+    """Raises LumigraphError if a texture of this side in texels exceeds memory."""
     what, less = f"A texture of {size} x {size} texels", "give a smaller --texture-size"
     ask_for(BYTES_PER_TEXEL * size * size, torch.device("cpu"), what, less)
 

@@ -33,8 +33,8 @@ class SkinnedCloud(Addition):
         self.bones, self.weights = BoneMotion(frame, bones), WeightVolume(frame, weights)
 
     def first_means(self, count: int, generator: torch.Generator) -> Float[Tensor, "gaussian 3"]:
-        """Random places about the bones at rest, evenly along them, as far from them as their first weights reach; of a
-        body of one bone, whose extent nothing tells, over a share of the way to the next body."""
+        """Random points around the bones at rest, evenly along them, within the reach of their initial weights; for a
+        body of one bone, which has no length, within a share of the distance to the next body."""
         parents, rest = self.bones.skeleton.parents, self.bones.skeleton.rest
         bones = segments(parents, rest.matrices[:, :, 3].float())
         starts, ends = (torch.cat(side) for side in zip(*bones, strict=True))

@@ -68,7 +68,7 @@ FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 
 
 class BlockNeRF(FieldMethod):
-    """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
+    """Radiance field conditioned on a photograph's appearance and exposure, with a visibility network."""
 
     Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | FrustumField
@@ -145,7 +145,7 @@ class BlockNeRF(FieldMethod):
         return terms
 
     def _counted(self, batch: Batch) -> Float[Tensor, " ray"]:
-        """1 for rays that teach, 0 for those that see what moved."""
+        """Mask of rays: 0 for those on transient objects."""
         if self.moving is None or batch.rays.image_index is None:
             return torch.ones_like(batch.rays.radius)
         weights = self.moving.weights(batch.rays.image_index, batch.extra["place"])
@@ -172,15 +172,16 @@ class BlockNeRF(FieldMethod):
 
     @property
     def shown_in(self) -> Appearance:
-        """Appearance of pictures: of the settings, else of the evidence, else the average; empty without codes."""
+        """Appearance code of renderings: of the settings, else of the evidence, else the average; empty without
+        codes."""
         return Appearance(self.appearance.shown(self) if self.appearance else torch.zeros(0, device=self.device))
 
     @property
     def usual_exposure(self) -> float | None:
-        """log2 of the median exposure of the photographs that it learnt from; None where that is not known."""
+        """log2 of the training photographs' median exposure; None if unknown."""
         return self.exposures.usual_stops if self.exposures else None
 
     @torch.no_grad()
     def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
-        """Share of each place, along a unit direction, that the photographs saw (section 4.2.5); 1 if not learnt."""
+        """Visibility of points along a unit direction from the photographs (section 4.2.5); 1 if not learnt."""
         return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

@@ -28,13 +28,13 @@ SAME = 0.01  # stops within which all photographs count as exposed alike
 
 
 class Exposures(Part):
-    """The log exposure of each photograph, in stops from the usual one, as waves (section 4.2.3).
+    """The log exposure of each photograph, in stops from the median one, encoded as waves (section 4.2.3).
 
-    usual: log2 of the median exposure of the photographs that are learnt from; 0 where none is known
-    stops: of each photograph from there, 0 where it is not known
-    known: whether it is
-    span:  the least and the most that is learnt from
-    taken: stops of a photograph that was given as evidence
+    usual: log2 of the training photographs' median exposure; 0 if unknown
+    stops: of each photograph relative to it, 0 if unknown
+    known: mask of photographs with a known exposure
+    span:  smallest and largest training exposure
+    taken: stops of an evidence photograph
     """
 
     taken: float | None = None
@@ -84,7 +84,7 @@ class Exposures(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Exposure within what was learnt from; none where all photographs were exposed alike."""
+        """Control of the exposure within the training range; none if all exposures are equal."""
         least, most = self.span.tolist()
         if most - least < SAME:
             return ()
@@ -102,7 +102,7 @@ class Exposures(Part):
         return () if self.usual_stops is None else (Photograph,)
 
     def adapted(self, method: Any, evidence: Photograph) -> Exposures:
-        """The part with the exposure of a photograph, where its camera's `image_index` tells."""
+        """The part with the exposure of an evidence photograph, found by its camera's `image_index`."""
         adapted, image = copy.copy(self), evidence.camera.image_index
         adapted.taken = None if image is None else self.stops_of(int(image[0]))
         return adapted
@@ -116,10 +116,10 @@ MUCH = 2.5  # times the median error of its photograph, below which a cell teach
 
 
 class Moving(Part):
-    """Remembers how much each part of each photograph errs, and says which are to be learnt from.
+    """Mask of transient objects from running errors of cells of each photograph.
 
-    error: mean absolute error of each cell lately; 0 where nothing is known yet
-    still: 1 for cells to learn from, else 0
+    error: running mean absolute error of each cell; 0 before the first
+    still: 1 for cells that are trained on, else 0
     """
 
     error: Tensor
@@ -131,12 +131,12 @@ class Moving(Part):
         self.register_buffer("still", torch.ones(image_count, CELLS, CELLS))
 
     def weights(self, image: Int[Tensor, " ray"], place: Float[Tensor, "ray 2"]) -> Float[Tensor, " ray"]:
-        """1 for rays to learn from, else 0. place: on the picture, shares of its width and height"""
+        """1 for rays that are trained on, else 0. place: on the picture, shares of its width and height"""
         return self.still.flatten()[cell_of(image, place)]
 
     @torch.no_grad()
     def note(self, image: Int[Tensor, " ray"], place: Float[Tensor, "ray 2"], error: Float[Tensor, " ray"]) -> None:
-        """Remember the absolute errors of rays."""
+        """Update the running absolute errors of rays' cells."""
         seen, which = cell_of(image, place).unique(return_inverse=True)
         total = torch.zeros(len(seen)).to(error).index_add_(0, which, error)
         mean = total / which.bincount(minlength=len(seen))
@@ -145,7 +145,8 @@ class Moving(Part):
 
     @torch.no_grad()
     def judge(self) -> None:
-        """Choose cells to learn from: their error and their neighbours' is below most, or near their photograph's."""
+        """Select cells to train on: their error and their neighbours' is below that of most, or close to their
+        photograph's."""
         known = self.error > 0
         if not known.any():
             return
@@ -172,11 +173,11 @@ HORIZON = 0.99  # of normalized_distance distances, where rays that do not end a
 
 
 class Visibility(Part):
-    """f_v(x, d) in [0, 1]: how much of what is at x a photograph that looks along d sees (Tancik 2022, section 4.2).
+    """f_v(x, d) in [0, 1]: visibility of x from photographs that look along d (Tancik 2022, section 4.2).
 
-    It is learnt from the transmittance of a field along the rays of photographs. The field itself learns nothing of it.
+    It is trained on the transmittance of a field along the rays of photographs, without gradients to the field.
 
-    octaves: of the waves that places are told by
+    octaves: of the encoding of points
     layers, width: hidden ones
     """
 
@@ -211,7 +212,7 @@ class Visibility(Part):
 def transmittance(
     samples: Samples, density: Float[Tensor, " sample"], t: Float[Tensor, " ray"]
 ) -> Float[Tensor, " ray"]:
-    """T = exp(-integral of density from the eye to t): the light that comes back from a distance along each ray."""
+    """T = exp(-integral of density from the eye to t): the transmittance up to a distance along each ray."""
     ray = samples.ray_index
     passed = torch.minimum(t[ray] - samples.t_start, samples.length).clamp_min(0)
     return torch.exp(-torch.zeros_like(t).index_add(0, ray, density * passed))

@@ -78,7 +78,7 @@ class DeformableSplatting(CloudMethod):
         )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
-        """Photographs around the middle moment at first, and more and more of the others (`all_moments_from`)."""
+        """Photographs around the middle time at first, and gradually all others (`all_moments_from`)."""
         train, until = super().joined_photographs(data), self.config.motion.all_moments_from
         times, share = data.cameras.time, self.progress / until if until else 1.0
         if times is None or self.frame.times is None or share >= 1:

@@ -60,8 +60,8 @@ class MotionNumbers:
 
 
 class SpaceTimePlanes(nn.Module):
-    """Features of points at moments: the product over six planes of what each holds (Fridovich-Keil 2023, eq. 1), scale
-    beside scale. Planes of time hold ones at first, so that nothing depends on it."""
+    """Features of points at times: the product of six planes (Fridovich-Keil 2023, eq. 1), scales concatenated. Planes
+    of time are one at first, so that nothing depends on it."""
 
     def __init__(self, numbers: MotionNumbers):
         super().__init__()
@@ -100,7 +100,7 @@ class SpaceTimePlanes(nn.Module):
 
 
 def spread(points: Float[Tensor, "point 3"], count: int) -> Int[Tensor, " chosen"]:
-    """Indices of points that are spread evenly: one in each cell of a grid, of which at most `count` hold points."""
+    """Indices of evenly spread points: one in each cell of a grid with at most `count` occupied cells."""
     low, size = points.amin(0), float((points.amax(0) - points.amin(0)).max().clamp_min(MIN_DISTANCE))
     best, cells = torch.zeros(1, dtype=torch.long), 1
     while True:
@@ -199,8 +199,8 @@ class PlaneMotion(Addition):
         shares: Float[Tensor, "gaussian carrier"],
         time: float,
     ) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]:
-        """Means, quaternions and log scales of Gaussians that the nodes carry along, each rigidly (Huang 2024, eqs. 5
-        and 6): m' = sum_k w_k (R_k (m - p_k) + p_k + x_k), q' = (sum_k w_k r_k) q."""
+        """Means, quaternions and log scales of Gaussians skinned to the nodes (Huang 2024, eqs. 5 and 6): m' = sum_k
+        w_k (R_k (m - p_k) + p_k + x_k), q' = (sum_k w_k r_k) q."""
         nodes = self.nodes[: int(self.node_count)]
         offset, turn, size = self.offsets(nodes, time)
         rotation = to_matrix(turn)
@@ -219,7 +219,8 @@ class PlaneMotion(Addition):
 
     @torch.no_grad()
     def follow_cloud(self, means: Float[Tensor, "gaussian 3"], apart: bool = False) -> None:
-        """Find neighbours of moving Gaussians. apart: tell static ones from them, by their offsets; else all move"""
+        """Update the neighbours of moving Gaussians. apart: separate static from moving ones by their offsets; else
+        all move"""
         count, device = len(means), means.device
         self.moves = torch.ones(count, dtype=torch.bool, device=device)
         if apart:
@@ -238,8 +239,8 @@ class PlaneMotion(Addition):
             self.neighbours[rows] = rows[torch.from_numpy(nearest[:, 1:]).to(device)]
 
     def place_nodes(self, means: Float[Tensor, "gaussian 3"], rows: Int[Tensor, " moving"]) -> None:
-        """Spread nodes among Gaussians that move, and find the nodes that carry each: the nearest, weighted by a normal
-        distribution as wide as their distance."""
+        """Sample nodes among moving Gaussians, and skin each Gaussian to its nearest nodes, with Gaussian weights of
+        the width of their distance."""
         points = means[rows].cpu()
         chosen = spread(points, self.numbers.nodes) if len(points) else rows.cpu()
         count = len(chosen)
@@ -256,7 +257,7 @@ class PlaneMotion(Addition):
         self.carriers[rows], self.shares[rows] = near, weight / weight.sum(1, keepdim=True)
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        """A neighbour that is pruned becomes the Gaussian itself, which costs nothing."""
+        """Remove Gaussians. A removed neighbour is replaced by the Gaussian itself, whose loss is zero."""
         kept = torch.arange(len(self.moves), device=self.moves.device)[keep]
         own = torch.arange(len(kept), device=kept.device)
         place = torch.full_like(self.moves, -1, dtype=torch.long).index_copy(0, kept, own)
@@ -281,8 +282,8 @@ class PlaneMotion(Addition):
             step.terms["rigidity"] = n.rigidity * self.bending(step.whole, step.moment, step.chance)
 
     def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
-        """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
-        distance; of some, at random, or of all nodes."""
+        """Mean squared change of neighbours' offsets in the frames of moving Gaussians, relative to their distance; of
+        a random subset, or of all nodes."""
         if self.node_count:
             places, links = (x[: int(self.node_count)] for x in (self.nodes, self.links))
             drawn = torch.arange(len(places), device=places.device)

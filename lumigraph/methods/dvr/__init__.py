@@ -71,8 +71,8 @@ SPHERE_RADIUS = 0.6  # of the first sphere, of that around the hull
 
 
 class DVR(SurfaceMethod):
-    """Learns occupancy and colour of points from photographs with masks; a ray sees the first point where occupancy
-    rises above a threshold."""
+    """Learns occupancy and colour of points from photographs with masks; a ray's surface is its first crossing of the
+    occupancy threshold."""
 
     Config, learns_from = Config, Scene
     learning_rate = exponential_decay
@@ -133,7 +133,7 @@ class DVR(SurfaceMethod):
         self._march_steps = round(c.march_steps / 2 ** math.ceil((1 - share) * doublings))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Raises LumigraphError for photographs without masks, and for places without bounds."""
+        """Raises LumigraphError for photographs without masks, and for scenes without bounds."""
         confirm(data)
         layers = ("depth",) if self.config.depth_weight else ()
         return data.sample_rays(self.config.rays_per_step, generator, layers=layers).to(self.device)
@@ -219,8 +219,8 @@ class DVR(SurfaceMethod):
         return self.with_normals(rays, t)
 
     def _met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Samples]:
-        """Distance at which each ray first enters what is occupied, infinity where it does not, and the places that
-        were looked at. Even steps in the hull find the crossing, the secant method narrows it down (section 3.2).
+        """Distance of each ray's first intersection with the surface, infinity without one, and the evaluated samples.
+        Equal steps in the hull bracket the crossing, the secant method refines it (section 3.2).
 
         Differentiable in the field where gradients are enabled (eq. 10).
         """
@@ -262,7 +262,7 @@ def sum_of_lengths(a: Float[Tensor, "point 3"], b: Float[Tensor, "point 3"]) -> 
 
 
 def confirm(data: Scene) -> None:
-    """Raises LumigraphError for photographs without masks, and for places without bounds."""
+    """Raises LumigraphError for photographs without masks, and for scenes without bounds."""
     if not data.images.has_alpha or data.frame.is_open:
         lacking = "have no masks" if not data.images.has_alpha else "show a place without bounds"
         raise LumigraphError(

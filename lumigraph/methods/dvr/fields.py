@@ -26,7 +26,7 @@ class OccupancyField(nn.Module):
         self.blocks = nn.Sequential(*(ResNetLayers(width, width) for _ in range(blocks)))
 
     def begin_as(self, centre: Float[Tensor, " 3"], radius: float) -> None:
-        """Nothing: it begins at random."""
+        """Nothing: the network is initialised at random."""
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Outputs:
         return self.last(self.blocks(self.first(points)).relu())
@@ -52,7 +52,7 @@ class TableField(nn.Module):
         self.register_buffer("radius", torch.tensor(0.5))
 
     def begin_as(self, centre: Float[Tensor, " 3"], radius: float) -> None:
-        """Take the sphere to begin as, ahead of the first step."""
+        """Set the initial sphere, before the first step."""
         self.centre.copy_(centre)
         self.radius.fill_(radius)
 

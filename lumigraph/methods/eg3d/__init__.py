@@ -109,7 +109,7 @@ class Config:
 
 @dataclass(frozen=True)
 class AdversarialLesson:
-    """Photographs with their cameras, and cameras of as many pictures to make."""
+    """Photographs with their cameras, and as many cameras of generated pictures."""
 
     unit: ClassVar[str] = "pictures"
 
@@ -133,7 +133,7 @@ RAYS_AT_ONCE = 16_384
 
 
 class ObjectGenerator(nn.Module):
-    """Mapping network, field and super-resolution: all that makes an object of a random code.
+    """Mapping network, field and super-resolution: the whole generator.
 
     average: moving average of styles
     """
@@ -159,8 +159,8 @@ class ObjectGenerator(nn.Module):
 
 
 class EG3D(Method):
-    """Learns from a Collection to draw objects that look like its photographs from everywhere; `given` a Scene, it
-    finds the object that looks like the scene's photographs."""
+    """Learns from a Collection to generate objects that look like its photographs; `given` a Scene, it inverts the
+    generator for the scene's photographs."""
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
     efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(500, 20_000), "best": Effort(5000, 200_000)}
@@ -307,7 +307,8 @@ class EG3D(Method):
         self.size.fill_(round(c.rendering_size + grown * (c.final_rendering_size - c.rendering_size)))
 
     def after_step(self, step: int) -> None:
-        """Let the averaged generator follow: it forgets half in so many pictures, fewer at the beginning."""
+        """Update the averaged generator: an exponential average with a half-life in pictures, shorter at the
+        beginning."""
         c = self.config
         half = min(c.average_pictures, AVERAGE_RAMP * (step + 1) * c.pictures_per_step)
         follow(self.averaged, self.generator, 0.5 ** (c.pictures_per_step / max(half, EPSILON)))
@@ -347,8 +348,8 @@ class EG3D(Method):
         return resized(features, size)
 
     def _seen(self, field: MadeField, made: Made, rays: Rays, random: torch.Generator | None = None) -> Rendering:
-        """Rendering of equally many rays through each field, by two passes of samples that are taken together (section
-        4.2). Features beyond colours are in the rendering's extras."""
+        """Rendering of equally many rays through each field, with coarse and fine samples merged (section 4.2).
+        Features beyond colours are in the rendering's extras."""
         c, count = self.config, len(rays)
         near, far = Box(self.frame.bounds, self.frame.near).interval(rays)
 
@@ -405,7 +406,7 @@ class EG3D(Method):
 
     @property
     def shown(self) -> tuple[Made, Style]:
-        """The field that is seen, and its style."""
+        """Field and style of the renderings."""
         if self._shown is None:
             with torch.no_grad():
                 style = self._style()[None]
@@ -413,8 +414,8 @@ class EG3D(Method):
         return self._shown
 
     def _style(self) -> Float[Tensor, " style"]:
-        """The style of what was found, or of the control's seed; between two seeds, one between their styles. Truncated
-        towards the average (Karras 2019, appendix B)."""
+        """Style of the inversion, or of the control's seed, interpolated between two seeds. Truncated towards the
+        average (Karras 2019, appendix B)."""
         if len(self.found.rows):
             style = self.found.rows[0]
         else:
@@ -425,7 +426,7 @@ class EG3D(Method):
         return torch.lerp(self.averaged.average, style, float(self.control("truncation")))
 
     def _styles_of(self, seeds: Sequence[int]) -> Style:
-        """Styles of seeds, on the pose that renderings are conditioned on."""
+        """Styles of seeds, conditioned on the pose of renderings."""
         codes = [torch.randn(self.config.code, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         with torch.no_grad():
             return self.averaged.mapping(torch.stack(codes).to(self.device), self.label.expand(len(seeds), -1))
@@ -442,7 +443,7 @@ class EG3D(Method):
         )
 
     def drawn(self, seed: int) -> Method:
-        """An object that nobody has photographed, of a random code."""
+        """A generated object, from a random code."""
         told = self.given()
         assert isinstance(told, EG3D)
         told._show(self._styles_of([seed]))
@@ -481,8 +482,7 @@ class EG3D(Method):
         return self.further_bytes(self.frame, c, True)
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same weights, told a scene's photographs: the object that looks like them, by a style and a generator
-        that is tuned to it."""
+        """The generator inverted for a scene's photographs: a style, and a generator fine-tuned to it."""
         scenes = [piece for piece in evidence if isinstance(piece, Scene)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
         assert isinstance(told, EG3D)
@@ -497,7 +497,7 @@ class EG3D(Method):
         self.settings.pop("seed", None)
 
     def _find(self, scene: Scene) -> None:
-        """Find the style of a scene's photographs, then tune the generator around it (Roich 2021, section 3)."""
+        """Fit the style of a scene's photographs, then fine-tune the generator around it (Roich 2021, section 3)."""
         c = self.config
         photographs = [scene.photograph(i) for i in scene.splits["train"].tolist()]
         both = [square(photograph, scene.frame, c.picture_size) for photograph in photographs]

@@ -21,7 +21,7 @@ Found = tuple[Float[Tensor, " point"], Float[Tensor, "point feature"]]
 
 
 class MadeField(nn.Module):
-    """Makes fields of styles: `made(styles)` is a field for each picture, `found` looks it up at points.
+    """Generates fields from styles: `made(styles)` is a field for each picture, `found` evaluates it at points.
 
     styles: number of styles; density is before its activation, features are in [0, 1], the first three colours
     """
@@ -30,7 +30,7 @@ class MadeField(nn.Module):
 
     @abstractmethod
     def made(self, styles: Styles, generator: torch.Generator | None = None) -> Made:
-        """Numbers of each field. generator: of noise, in training"""
+        """Tensors of each field. generator: of noise, in training"""
 
     @abstractmethod
     def found(self, made: Float[Tensor, "row number"], points: Points) -> Found:

@@ -18,8 +18,8 @@ Pictures = Float[Tensor, "picture _ _ _"]
 
 
 class ModulatedConvolution(nn.Module):
-    """Convolution whose input channels a style scales, and whose outputs are brought back to a variance of one
-    (Karras 2020, eqs. 1 and 3).
+    """Convolution with input channels scaled by a style, and outputs normalised to unit variance (Karras 2020, eqs. 1
+    and 3).
 
     up:           twice the size, as a transposed convolution and the filter 1 3 3 1
     demodulated:  divide outputs by their expected deviation
@@ -152,7 +152,7 @@ class SuperResolution(nn.Module):
 
 
 class PlaneDecoder(nn.Module):
-    """Density before its activation, and features in [0, 1], from what the planes hold at a point (section 4.1)."""
+    """Density before its activation, and features in [0, 1], from a point's plane features (section 4.1)."""
 
     def __init__(self, inputs: int, width: int, features: int):
         super().__init__()

@@ -392,9 +392,9 @@ class BlockGrid:
         return BlockGrid(labels, torch.tensor(shape, device=device).float(), occupied, occupied.float(), corners, nodes)
 
     def sampled(self, rays: Rays, step: float, depth: float, jitter: Float[Tensor, " ray"] | None) -> Samples:
-        """Samples of rays within blocks, a step apart; each ray ends after a way of `depth` blocks through them.
+        """Samples of rays within blocks, a step apart; each ray ends after a length of `depth` blocks inside them.
 
-        rays, step, depth: in blocks; jitter: share of a step by which each ray's samples are moved
+        rays, step, depth: in blocks; jitter: random offset of each ray's samples, as a share of a step
         """
         half = self.occupied.shape[1] / 2  # the kernel's cube goes from -1 to 1
         enter, leave = rays.through_box(torch.stack([torch.zeros_like(self.size), self.size]))

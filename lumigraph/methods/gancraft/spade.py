@@ -18,7 +18,7 @@ LEVELS = (2, 3, 4)  # of the adversary's pyramid, at which it decides
 
 
 def convolution(inputs: int, outputs: int) -> nn.Conv2d:
-    """A convolution of 3x3 that goes on beyond a picture's border with the colours there."""
+    """A 3x3 convolution with replicated borders."""
     return nn.Conv2d(inputs, outputs, 3, 1, 1, padding_mode="replicate")
 
 
@@ -122,7 +122,7 @@ class Adversary(nn.Module):
         self.score, self.label = SpectralConvolution(lateral, 1, 1), SpectralConvolution(labels, lateral, 1)
 
     def iterate(self) -> None:
-        """Bring the norms of all weights up to date, once a step."""
+        """One power iteration for the spectral norms of all weights, once a step."""
         for module in self.modules():
             if isinstance(module, SpectralConvolution):
                 module.iterate()
@@ -152,7 +152,7 @@ class Adversary(nn.Module):
 
 
 def halves(features: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor]]:
-    """Features of the first so many pictures, and of the others."""
+    """Features of the first `count` pictures, and of the others."""
     return [x[:count] for x in features], [x[count:] for x in features]
 
 
@@ -162,9 +162,9 @@ def perceptual(fake: Sequence[Pictures], real: Sequence[Pictures]) -> Tensor:
 
 
 def channels(labels: Int[Tensor, "picture height width"], count: int, smooth: int = 0) -> Pictures:
-    """A channel for each label, 1 where it is.
+    """One-hot channels of labels.
 
-    smooth: diameter of the window within which the most frequent label counts, pixels; 0 leaves labels as they are
+    smooth: diameter of the majority filter, pixels; 0 for none
     """
     found = one_hot(labels, count).movedim(-1, 1).float()
     if smooth > 1:

@@ -136,8 +136,8 @@ def depth_roughness(seen: Splatted) -> Float[Tensor, ""]:
 def visible_points(
     points: Float[Tensor, "point 3"], camera: Camera
 ) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " seen"], Int[Tensor, " seen"]]:
-    """Row and column, depth along the axis, and index of the points that one camera sees, unless another point within
-    a pixel lies in front."""
+    """Row and column, depth along the axis, and index of the points visible in one camera, with occlusion by other
+    points within a pixel."""
     width, height = camera.size[0].tolist()
     place, inside = camera.locate(points)
     depth = (points - camera.position[0]) @ camera.forward[0]
@@ -153,7 +153,7 @@ def visible_points(
 def surface_error(
     seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"], colours: Float[Tensor, "point 3"]
 ) -> Float[Tensor, ""]:
-    """Error of a picture at points that it is to show: of colours, of the logarithm of depth, and light that passes."""
+    """Error of a picture at known surface points: of colours, of log depth, and transmittance."""
     opacity = seen.opacity[place]
     ratio = (seen.depth[place] / opacity.clamp_min(1e-3)).clamp_min(1e-4) / depth
     off = (ratio.log().abs().clamp(max=MAX_LOG_ERROR) * opacity.detach()).mean()

@@ -49,8 +49,8 @@ class Identities(Addition):
     """Identity codes and a linear classifier. They change neither positions nor colours.
 
     codes:  of each Gaussian
-    places: of each Gaussian when its code was last followed: a cloud that was densified finds its codes by them
-    seen:   labels that photographs have
+    places: positions of the Gaussians at the last `follow`, to transfer codes after densification
+    seen:   labels in the photographs
     """
 
     grows: ClassVar[tuple[str, ...]] = ("codes", "places")
@@ -81,7 +81,7 @@ class Identities(Addition):
         self._set(drawn.to(self.places.device), cloud.means.detach().clone())
 
     def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
-        """Codes for a cloud whose Gaussians were cloned, split or pruned: of the nearest old one."""
+        """Transfer codes to a cloned, split or pruned cloud: from the nearest old Gaussian."""
         if len(means) == len(self.places) and torch.equal(means.detach(), self.places):
             return
         if len(means) != len(self.places):
@@ -94,7 +94,7 @@ class Identities(Addition):
         self._set(self.codes.data[keep], self.places[keep])
 
     def _set(self, codes: Tensor, places: Tensor) -> None:
-        """Replace the codes. Their moments begin anew, for a cloud changes every hundred steps."""
+        """Replace the codes, with fresh optimizer moments, for a cloud changes every hundred steps."""
         old, self.places = self.codes, places
         self.codes = nn.Parameter(codes.clone())
         if self.optimizer is not None:

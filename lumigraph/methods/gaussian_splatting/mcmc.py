@@ -92,7 +92,7 @@ class MarkovChain(DensityControl):
 
 
 def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"]) -> Gaussians:
-    """Opacity and scale of each of n copies that together look as the one they replace (Kheradmand 2024, eq. 10).
+    """Opacity and scale of each of n copies that together render like the original (Kheradmand 2024, eq. 10).
 
     Opacity o' = 1 - (1 - o)^(1/n);
     scale times o / sum_{i=1..n} sum_{k<i} binomial(i - 1, k) (-1)^k o'^(k+1) / sqrt(k + 1).

@@ -69,7 +69,7 @@ class RobustMask(Addition):
 
     @torch.no_grad()
     def record(self, residual: Float[Tensor, "height width"]) -> None:
-        """Add a photograph's residuals to the histogram, but for zeros, of pixels without content in either."""
+        """Add a photograph's residuals to the histogram, except zeros, which are pixels without content in either."""
         some = residual[residual > 0]
         self.histogram.mul_(HISTOGRAM_DECAY).add_(torch.histc(some, BINS, 0, 1) / max(len(some), 1))
 

@@ -45,7 +45,7 @@ class Config:
 
 
 class HumanNeRF(Articulated, FieldMethod):
-    """A canonical field, and the way to it from a body in any pose."""
+    """A canonical field, and the deformation from a posed body to it."""
 
     Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: PosedField
@@ -89,7 +89,7 @@ class HumanNeRF(Articulated, FieldMethod):
         return self.sampler.sample(rays, self.posed(times), rows[:, None].float(), generator)
 
     def shown_field(self) -> PosedField:
-        """The field in the pose of pictures, by the settings."""
+        """The field in the pose of renderings, by the settings."""
         return self.posed(torch.tensor([self.moment_of()], device=self.device))
 
     def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:

@@ -99,7 +99,7 @@ class PosedField(Field):
         self.poses: BodyPoses | None = None
 
     def posed(self, transforms: Float[Tensor, "moment bone 3 4"], angles: Float[Tensor, "moment angle"]) -> PosedField:
-        """The same field in poses at moments, which codes count. transforms: of bones, from rest to posed"""
+        """The same field in poses; codes are rows of them. transforms: of bones, from rest to posed"""
         field = copy.copy(self)
         field.poses = BodyPoses(rigid_inverse(transforms), angles, self.volume.weights())
         return field
@@ -142,7 +142,7 @@ class PosedField(Field):
         return torch.zeros_like(body).index_copy(0, inside, self.canonical.density(placed) * body[inside])
 
     def _moved(self, rest: Points, rows: Int[Tensor, " point"]) -> Points:
-        """Canonical places of places at rest: with the non-rigid offset."""
+        """Canonical positions of points at rest, with the non-rigid offset."""
         assert self.poses is not None
         return self.offset(rest, self.poses.angles[rows])
 

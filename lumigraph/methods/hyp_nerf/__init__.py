@@ -77,7 +77,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Observations of one scene: some rays, cells that may hold something, and the colour behind it."""
+    """Observations of one scene: some rays, possibly occupied cells, and the background colour."""
 
     rays: Batch
     cells: OccupancyGrid
@@ -86,7 +86,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class InstanceLesson:
-    """Members by number with what is known of each; and a part of a photograph of the last, for the denoiser."""
+    """Members by number with the evidence of each; and a patch of a photograph of the last, for the denoiser."""
 
     unit: ClassVar[str] = "rays"
 
@@ -100,7 +100,7 @@ class InstanceLesson:
 
 
 class TensorChanges(torch.nn.Module):
-    """Changes of an instance's tensors by tuning: a row of each, or none."""
+    """Changes of an instance's tensors by fine-tuning: a row of each, or none."""
 
     def __init__(self, rows: Iterable[Float[Tensor, "_ _ _"]]):
         super().__init__()
@@ -128,8 +128,8 @@ Seen = Callable[[int, torch.Generator], Evidence]  # so many random rays of what
 
 
 class HypNeRF(RayMethod):
-    """Learns from a Collection a code for each member, and what a code means; `given` a Scene, it finds the code whose
-    field looks like its photographs and tunes that field to them."""
+    """Learns from a Collection a code for each member and a hypernetwork of codes; `given` a Scene, it fits the code to
+    its photographs and fine-tunes that field."""
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
     learning_rate = exponential_decay
@@ -212,7 +212,7 @@ class HypNeRF(RayMethod):
         return InstanceLesson(members, evidence, rays.to(self.device), picture.to(self.device))
 
     def _cells_of(self, scene: Scene) -> OccupancyGrid:
-        """The cells of a scene that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
+        """Mask of a scene's cells that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
         if scene.frame.is_open:
             raise LumigraphError(
                 f"hyp-nerf knows objects, and {scene.source} is a place without bounds; name photographs of an object"
@@ -223,7 +223,7 @@ class HypNeRF(RayMethod):
         return cells.to(self.device)
 
     def loss(self, batch: InstanceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
-        """The squared error of colours of all members (eq. 2), density where nothing is, and the denoiser's error."""
+        """The squared error of colours of all members (eq. 2), density in empty space, and the denoiser's error."""
         generator, share = self.random(step), 1 / len(batch.members)
         codes = self.codes(torch.tensor(batch.members, device=self.device))
         instances = self._made(codes)
@@ -270,7 +270,7 @@ class HypNeRF(RayMethod):
         background: Float[Tensor, "#ray 3"],
         jitter: Float[Tensor, " ray"] | None = None,
     ) -> Rendering:
-        """Rendering of an instance from all samples in cells: few lie far behind visible surfaces."""
+        """Rendering of an instance from all samples in cells, without early termination: few are occluded."""
         samples = cells.sample(rays, self.frame.near, self.step_length, jitter=jitter)
         density, rgb = instance(*samples.along(rays))
         self.figures |= {"rays": len(rays), "samples": len(samples)}
@@ -290,14 +290,14 @@ class HypNeRF(RayMethod):
     # Instances
 
     def _made(self, codes: Float[Tensor, "member code"]) -> list[HashInstance]:
-        """The fields that codes mean (section 3.2): table and density of the shape's, colour of the colour's."""
+        """Fields of codes (section 3.2): table and density of the shape's code, colour of the colour's."""
         shape, colour = codes.split([self.config.shape_code, self.config.colour_code], -1)
         made = self.hyper([colour if is_colour else shape for is_colour in self.shape.of_colour])
         return [HashInstance(self.shape, tensors) for tensors in made]
 
     @property
     def shown(self) -> tuple[HashInstance, OccupancyGrid]:
-        """The field that is seen, and the cells where it holds something."""
+        """The field of renderings, and its occupied cells."""
         if self._shown is None:
             with torch.no_grad():
                 instance = self._told()
@@ -305,7 +305,7 @@ class HypNeRF(RayMethod):
         return self._shown
 
     def _filled(self, instance: HashInstance) -> OccupancyGrid:
-        """The cells where a field holds something."""
+        """Occupied cells of a field."""
         c, generator = self.config, self.random(0)
         cells = OccupancyGrid(1.0, c.occupancy_resolution).to(self.device)
 
@@ -317,7 +317,7 @@ class HypNeRF(RayMethod):
         return cells
 
     def _told(self) -> HashInstance:
-        """The field of the code that was told; of the one that was found, as it was tuned."""
+        """Field of the code in the control `instance`; for a code fitted to evidence, with its fine-tuned tensors."""
         value = str(self.control("instance"))
         (instance,) = self._made(self.codes.code_of(value, **self._others)[None])
         first, second, share = blend(value)
@@ -342,12 +342,12 @@ class HypNeRF(RayMethod):
         return 1
 
     def evidence_bytes(self, scene: Scene) -> int:
-        """The pixels that are looked at, as rays."""
+        """Bytes of the photographs' sampled pixels, as rays."""
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """An object of which photographs are told: the code is found that looks like them, then the field is tuned to
-        them (section 3.3); or another one of those that were learnt."""
+        """The field fitted to an object's photographs: first its code, then its tensors (section 3.3); or another
+        trained one."""
         scenes = [piece for piece in evidence if isinstance(piece, Scene)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
         assert isinstance(told, HypNeRF)
@@ -359,7 +359,7 @@ class HypNeRF(RayMethod):
         return told
 
     def drawn(self, seed: int) -> Method:
-        """An object that nobody has photographed: a code from the Gaussian that fits the learnt ones."""
+        """A random object: a code from the Gaussian fitted to the trained codes."""
         told = super().given()
         assert isinstance(told, HypNeRF)
         told.found, told._shown = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None]), None
@@ -368,7 +368,7 @@ class HypNeRF(RayMethod):
         return told
 
     def _find(self, scene: Scene) -> None:
-        """The code and the tuned tensors of a scene, kept here."""
+        """Fit the code and the tensors of a scene, and store them."""
         c, there = self.config, scene.splits["train"]
         photographs = [scene.photograph(i) for i in there.tolist()]
         cells, background = self._cells_of(scene), torch.tensor([scene.frame.background], device=self.device)
@@ -388,7 +388,7 @@ class HypNeRF(RayMethod):
         self.tuned = TensorChanges((tensor - first)[None] for tensor, first in pairs)
 
     def _code_of(self, seen: Seen) -> Float[Tensor, " code"]:
-        """The code that explains photographs best, not far from those that were learnt (section 3.3)."""
+        """The code with the smallest error on photographs, regularised towards the trained ones (section 3.3)."""
         axes, average, generator = self.codes.axes, self.codes.average, self.random(2)
 
         def error(where: Float[Tensor, " axis"]) -> Tensor:
@@ -403,7 +403,7 @@ class HypNeRF(RayMethod):
 
     @torch.no_grad()
     def _nearest(self, seen: Seen) -> Float[Tensor, " code"]:
-        """The learnt code that explains photographs best, or the average."""
+        """The trained code with the smallest error on photographs, or the average."""
         known = self.codes.rows[self.codes.learnt]
         some = torch.randperm(len(known), generator=self.random(3))[:MAX_CANDIDATES]
         codes = torch.cat([self.codes.average[None], known[some.to(known.device)]])
@@ -414,7 +414,7 @@ class HypNeRF(RayMethod):
 
     @torch.enable_grad()
     def _tuned_to(self, sources: Sequence[Seen], tensors: Sequence[Tensor], steps: int, number: int) -> list[Tensor]:
-        """Tensors of a field after so many steps of learning from photographs, and from denoised views after them."""
+        """Tensors of a field after fine-tuning steps on photographs, then on denoised views."""
         tuned = [tensor.detach().clone().requires_grad_() for tensor in tensors]
         adam, generator = torch.optim.Adam(tuned, eps=1e-15), self.random(number)
         instance, rate = HashInstance(self.shape, tuned), TUNE_LEARNING_RATE
@@ -429,7 +429,7 @@ class HypNeRF(RayMethod):
 
     @torch.no_grad()
     def _denoised_views(self, instance: HashInstance, like: Camera, background: Float[Tensor, "1 3"]) -> Seen:
-        """Renderings of a field from all around, denoised, as photographs of it (section 3.2)."""
+        """Denoised renderings of a field from all around, as further photographs (section 3.2)."""
         cells, views = self._filled(instance), list[Photograph]()
         for camera in around(like, self.frame, self.config.denoise_views, self.up.cpu()):
             rays = camera.rays(camera.pixels()).to(self.device)
@@ -469,7 +469,7 @@ def untuned(shape: HashShape) -> TensorChanges:
 
 
 def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-    """Mask of the points of [-1, 1]^3 in cells that may hold something."""
+    """Mask of the points of [-1, 1]^3 in possibly occupied cells."""
     x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
     return cells.occupied[0, x, y, z]
 
@@ -487,7 +487,7 @@ def patch(
 
 
 def around(camera: Camera, frame: Frame, count: int, up: Float[Tensor, " 3"]) -> Iterator[Camera]:
-    """Cameras with the same lens, as far from the middle, all around it and now lower, now higher. up: unit length"""
+    """Cameras with the same lens and distance from the centre, around it at alternating heights. up: unit length"""
     middle = torch.tensor(frame.bounds).mean(0)
     distance = (camera.position - middle).norm()
     turn = turning(torch.tensor([0.0, 0.0, 1.0]), up).float()

@@ -20,10 +20,10 @@ TABLE, CALM = 1e-4, 0.1  # of a table's first entries; of what codes change at f
 
 
 class HyperNetwork(nn.Module):
-    """One perceptron for each tensor (Sen 2023, section 3.2; as Sitzmann 2020 has it): its last bias is the tensor that
-    all instances have in common, and its last layer's weights say how they differ.
+    """One perceptron for each tensor (Sen 2023, section 3.2; as in Sitzmann 2020): its last bias is the tensor common
+    to all instances, and its last layer's weights span their differences.
 
-    codes:  for each tensor, numbers of the code that it is made of
+    codes:  size of the code of each tensor
     width, layers: of the hidden layers
     shapes: of the tensors; the first one is a table, all others are layers without biases
     """

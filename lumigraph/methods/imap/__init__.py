@@ -94,11 +94,11 @@ class Config:
 
 
 class IMap(FieldMethod):
-    """One step is one frame: find its pose in the map, decide whether it is a keyframe, then descend on the map and the
-    poses of keyframes together. Steps after the last frame map on.
+    """One step is one frame: estimate its pose in the map, decide whether it is a keyframe, then optimise the map and
+    the keyframes' poses jointly. Steps after the last frame continue mapping.
 
-    losses:   of each image and region of active sampling, as they were last measured; those of keyframes count
-    snapshot: the map when the latest keyframe was added, by which frames are judged (section 3.4)
+    losses:   last measured loss of each image and region of active sampling; those of keyframes are used
+    snapshot: the map at the latest keyframe, for keyframe selection (section 3.4)
     """
 
     Config = Config
@@ -189,7 +189,8 @@ class IMap(FieldMethod):
 
     @torch.no_grad()
     def explained(self, field: Any, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> float:
-        """Share P of pixels whose depth a map explains (eq. 9): of a table, whose surface is near what was measured."""
+        """Share P of pixels with depth explained by the map (eq. 9); of a table, with its surface close to the
+        measured depth."""
         pixels = frame.sample_pixels(EXPLAINED_PIXELS, chance, measured=True)
         if not len(pixels):
             return 0.0
@@ -275,8 +276,8 @@ class IMap(FieldMethod):
         return terms
 
     def window(self, joined: list[int], current: DepthFrame | None, chance: torch.Generator) -> list[int]:
-        """Places in `joined` of the frames of one descent: the current and the latest keyframe, others by their mean
-        loss or evenly."""
+        """Indices in `joined` of the frames of one iteration: the current and the latest keyframe, others sampled by
+        their mean loss or uniformly."""
         latest = [i for i, index in enumerate(joined) if current is not None and index == current.index]
         latest = list(dict.fromkeys([*latest, len(joined) - 1]))
         others = [i for i in range(len(joined)) if i not in latest]
@@ -304,7 +305,7 @@ class IMap(FieldMethod):
 
     @torch.no_grad()
     def remember(self, drawn: Sequence[tuple[DepthFrame, Tensor]], error: Float[Tensor, " ray"]) -> None:
-        """Keep the mean error of the regions that were drawn from."""
+        """Store the mean error of the sampled regions."""
         if not self.config.mapping.active_sampling:
             return
         for (frame, pixels), own in zip(drawn, error.split([len(p) for _, p in drawn]), strict=True):

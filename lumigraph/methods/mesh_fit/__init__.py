@@ -175,7 +175,7 @@ class MeshFit(Method):
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """The paper's Adam for places, whose steps are as long as gradients are large beside each other."""
+        """The paper's Adam for vertices, with one step length for all of them; Adam for colours."""
         places = UniformAdam([{"params": [self.surface.places], "name": "places"}])
         colours = torch.optim.Adam([{"params": [self.surface.colours], "name": "colours"}])
         self._optimizers = places, colours
@@ -250,7 +250,7 @@ def hull(scene: Scene, cells: int) -> Mesh:
 
 
 def surface_of(teacher: Any, cameras: Camera, cells: int) -> Mesh:
-    """The surface of a method's fused depth maps, closed around what no camera sees, with its colours."""
+    """Surface of a method's fused depth maps with its colours, closed in regions that no camera sees."""
     frame = teacher.frame
     maps = render_depth_maps(teacher.render, cameras, frame.background, TEACHER_VIEWS, TEACHER_SIZE)
     low, high = (np.array(corner) for corner in frame.bounds)

@@ -12,8 +12,8 @@ from ...components.training.row_optimizers import RowOptimizer, adam_moments, ad
 class UniformAdam(RowOptimizer):
     """Adam that divides by the root of the largest second moment instead of each coordinate's own.
 
-    So the direction of a step is that of the mean gradient. Adam would move vertices with small gradients as far as
-    others, and along axes.
+    Steps so have the direction of the mean gradient. Adam would move vertices with small gradients as far as others,
+    and along axes.
     """
 
     def __init__(self, params: Any, lr: float = 1e-2, betas: tuple[float, float] = (0.9, 0.999)):

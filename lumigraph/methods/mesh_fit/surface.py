@@ -66,7 +66,7 @@ class _Smooth(torch.autograd.Function):
 
 
 class MeshSurface(Part):
-    """Triangles of which places and colours of vertices are learnt.
+    """A mesh with trainable positions and colours of vertices.
 
     places:  u = (I + smoothness L) x of vertices x (Nicolet 2021, eq. 9)
     colours: of vertices, before the sigmoid
@@ -86,7 +86,7 @@ class MeshSurface(Part):
         return self.corners.faces
 
     def replace(self, mesh: Mesh, optimizers: tuple[torch.optim.Optimizer | None, ...] = (None, None)) -> None:
-        """Another mesh; what optimizers remembered of the old one is forgotten."""
+        """Replace the mesh, with fresh optimizer moments."""
         self.corners.faces = torch.from_numpy(np.ascontiguousarray(mesh.faces)).long().to(self.corners.faces.device)
         places = self.solver.apply(torch.from_numpy(mesh.vertices).float())
         exchange(self, "places", places.contiguous(), optimizers[0])
@@ -177,8 +177,8 @@ def vertex_normals(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face
 
 
 def remeshed(mesh: Mesh, cells: int) -> Mesh:
-    """The same surface from a grid of its signed distance, of so many cells along its longest side: triangles of one
-    size, without those that lie inside it or go through each other."""
+    """The same surface remeshed from a grid of its signed distance, with `cells` cells along its longest side:
+    triangles of one size, without interior and self-intersecting ones."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     cell = float((high - low).max()) / cells
     low = low - 2 * cell
@@ -204,7 +204,7 @@ def remeshed(mesh: Mesh, cells: int) -> Mesh:
 
 
 def _spread(mesh: Mesh, cell: float):
-    """Places on all triangles, less than a cell apart."""
+    """Points on all triangles, less than a cell apart."""
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(-1)
     parts = np.ceil(longest / cell).astype(int)

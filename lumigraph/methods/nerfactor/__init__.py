@@ -70,7 +70,7 @@ PROPERTY_WIDTH = 128  # width of a property's network, section 3
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers and its release's (nerfactor.ini, shape.ini, brdf.ini), with a hash table for the NeRF."""
+    """The paper's and its release's parameters (nerfactor.ini, shape.ini, brdf.ini), with a hash table for the NeRF."""
 
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
@@ -127,11 +127,11 @@ class Shading(NamedTuple):
 
 
 class NeRFactor(FieldMethod):
-    """A field learns from photographs; its geometry is frozen; properties of its surface and the light learn on.
+    """A field is trained on photographs; its geometry is frozen; then surface properties and light are trained.
 
     stage:  1 once geometry is frozen
     began:  share of the budget at which it was; -1 before
-    known:  environment maps of the photographs, where they are known
+    known:  the photographs' environment maps, if known
     """
 
     Config, accepts = Config, (EnvironmentLight,)
@@ -191,7 +191,7 @@ class NeRFactor(FieldMethod):
         return sampling_bytes(frame, config, learning) + pairs * kept * learning
 
     def _choose_learning(self) -> None:
-        """Let geometry learn at first, then all else alone."""
+        """Set trainable parameters: geometry first, later all others."""
         surface = bool(self.stage)
         self.network.requires_grad_(not surface)
         for part in (self.properties, self.lights_seen):
@@ -214,7 +214,7 @@ class NeRFactor(FieldMethod):
         return ways.to(self.device), angles.to(self.device)
 
     def environment(self) -> EnvironmentLight:
-        """The light that was learnt, or that of the photographs, of the first where they differ."""
+        """The learnt light, or the photographs' known one, of the first if they differ."""
         found = self.log_light.exp() if self.config.light == "unknown" else self.known[0]
         return EnvironmentLight(found.detach().cpu())
 
@@ -238,7 +238,7 @@ class NeRFactor(FieldMethod):
         return ways.to(self.device), power.to(self.device)[None]
 
     def shown_light(self) -> EnvironmentLight | None:
-        """The light that replaces the photographs', by the settings; None where theirs is shown."""
+        """Light of the settings that replaces the photographs'; None for theirs."""
         kind, said = str(self.control("light")), {name: float(self.control(name)) for name in UNSAID}
         if kind == SUN or (kind == CAMERAS_LIGHT and self._told is None and said != UNSAID):
             azimuth, elevation, sun, sky = (SUN_DEFAULTS[k] if x == UNSAID[k] else x for k, x in said.items())
@@ -271,7 +271,8 @@ class NeRFactor(FieldMethod):
             self.known[image] = EnvironmentLight(radiance).resized(rows, 2 * rows).radiance.to(self.device)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Take over a teacher's density and colour; geometry learns on for the rest of its share of the budget."""
+        """Copy or distil a teacher's density and colour; geometry is trained further for the rest of its share of
+        the budget."""
         if self._is_alike(teacher):
             self.network.load_state_dict(teacher.network.state_dict())
             self.sampler = copy.deepcopy(teacher.sampler)
@@ -286,7 +287,7 @@ class NeRFactor(FieldMethod):
             self.lobes.learn(PRIOR_STEPS, 1e-2, self.random(1))
 
     def _is_alike(self, teacher: Any) -> bool:
-        """True if a teacher has a hash table of the same sizes and the same sampler, so that nothing need be taught."""
+        """True if a teacher has a hash table of the same sizes and the same sampler, so that weights can be copied."""
         own, other = self.network, getattr(teacher, "network", None)
         if not isinstance(other, HashField) or type(teacher.sampler) is not type(self.sampler):
             return False
@@ -294,7 +295,7 @@ class NeRFactor(FieldMethod):
         return shapes[0] == shapes[1]
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Rays of a step. Geometry is frozen here when its share of the budget is over."""
+        """Rays of a step. Freezes geometry after its share of the budget."""
         if not self.stage and self.progress >= self.config.geometry_share:
             self.grid.fill(self.density, self.random(2))
             self.stage.fill_(1)
@@ -335,7 +336,7 @@ class NeRFactor(FieldMethod):
         near = self.properties.oriented(other.normals, given)
 
         def mean(values: Tensor) -> Tensor:
-            """Mean over all rays of the step; those beside the surface have nothing to differ in."""
+            """Mean over all rays of the step; rays without a surface count as zero."""
             return values.sum() / (len(batch) * values.shape[-1])
 
         terms = {
@@ -553,13 +554,13 @@ def albedo_of(raw: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
 
 
 def facing(normals: Float[Tensor, "point 3"], eyes: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-    """Normals, those that look away from the eye turned until they barely face it."""
+    """Normals, with back-facing ones turned until they barely face the eye."""
     lacking = (MIN_FACING - (normals * eyes).sum(-1, keepdim=True)).clamp_min(0)
     return unit(normals + lacking * eyes)
 
 
 def tone(light: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:
-    """Linear light encoded as sRGB, without an end at white."""
+    """Linear light encoded as sRGB, not clipped at white."""
     return encoded(light.clamp_min(1e-5))
 
 

@@ -11,10 +11,10 @@ from numba import njit, prange
 
 @njit(parallel=True, fastmath=True, cache=True)
 def transmittance(thickness, clear, low, cell, step, stop, points, normals, directions, out):
-    """Light that reaches each point from directions above its surface.
+    """Transmittance from each point in directions above its surface.
 
-    thickness: optical, of a step in each cell; clear: steps from each cell that meet nothing; low: corner of the grid;
-    step: in cells; stop: optical thickness at which nothing is left
+    thickness: optical, of a step in each cell; clear: number of empty steps from each cell; low: corner of the grid;
+    step: in cells; stop: optical thickness at which rays terminate
     """
     nx, ny, nz = thickness.shape
     half = np.float32(0.5) * step

@@ -30,7 +30,7 @@ def microfacet(
 
         f = D(h) G(l) G(v) F(v.h) / (4 n.l n.v),    alpha = roughness^2
 
-    by the cosines between normal n, light l and eye v
+    from the cosines between normal n, light l and eye v
     """
     nl, nv = nl.clamp_min(MIN_COSINE), nv.clamp_min(MIN_COSINE)
     vh = (0.5 + 0.5 * vl).clamp_min(1e-6).sqrt()  # |l + v| = 2 v.h
@@ -95,8 +95,8 @@ class LearntReflectance(nn.Module):
         return self(rusinkiewicz(n, v, directions.repeat(len(normals), 1)), z).reshape(shape)
 
     def learn(self, steps: int, learning_rate: float, generator: torch.Generator) -> float:
-        """Learn lobes of many roughnesses as an autodecoder, with a code for each; the loss compares logarithms
-        (section 3.3). Gives the last loss."""
+        """Train lobes of many roughnesses as an autodecoder, with a code for each; the loss compares logarithms
+        (section 3.3). Returns the last loss."""
         device = next(self.network.parameters()).device
         roughness = torch.linspace(MIN_ROUGHNESS, 1.0, PRIOR_LOBES, device=device)
         codes = nn.Parameter((CODE_DEVIATION * torch.randn(PRIOR_LOBES, self.code, generator=generator)).to(device))

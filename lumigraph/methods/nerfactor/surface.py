@@ -34,10 +34,10 @@ SURFACE_SHARE = 0.25  # share of a ray's opacity at which its surface is; half l
 
 
 class SurfaceGrid(Part):
-    """Density of a scene in cells of its box of interest, cubes, and a blurred solid.
+    """Density of a scene in cubic cells of its box of interest, and blurred occupancy.
 
     extinction: mean density of each cell, per scene unit
-    solid:      share of each cell that is filled, blurred
+    solid:      blurred filled share of each cell
     """
 
     extinction: Tensor
@@ -63,7 +63,7 @@ class SurfaceGrid(Part):
 
     @torch.no_grad()
     def fill(self, density: Callable[[Tensor], Tensor], chance: torch.Generator, samples: int = 2) -> None:
-        """Take a field's density at random places of each cell."""
+        """Sample a field's density at random points of each cell."""
         index = torch.stack(torch.meshgrid(*(torch.arange(n) for n in self.extinction.shape), indexing="ij"), -1)
         for part, cells in zip(
             torch.arange(self.extinction.numel()).split(POINTS_PER_CHUNK),
@@ -86,7 +86,7 @@ class SurfaceGrid(Part):
         return grid_sample(grid[None, None], places[None, None, None], align_corners=False)[0, 0, 0, 0]
 
     def normals(self, points: Float[Tensor, "point 3"], eyes: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Outward unit normals: minus the slope of the blurred solid; towards the eye where it has none."""
+        """Outward unit normals: minus the gradient of blurred occupancy; towards the eye where that is zero."""
         steps = self.cell * torch.eye(3, device=points.device)
         each = [self.at(self.solid, points + step) - self.at(self.solid, points - step) for step in steps]
         slope = torch.stack(each, -1)

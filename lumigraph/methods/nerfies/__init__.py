@@ -164,7 +164,7 @@ class Nerfies(FieldMethod):
         super().begin(data, seconds)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Rays of the moments that have joined: at first those of a tenth of the capture."""
+        """Rays of the times that have joined: at first those of a tenth of the capture."""
         d, time = self.config.deformation, data.cameras.time
         if self.progress < d.growth and time is not None and self.frame.times is not None:
             first, last = self.frame.times
@@ -214,7 +214,7 @@ class Nerfies(FieldMethod):
         return total / len(rays) * elastic_loss(jacobian, ELASTIC_SCALE).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
-        """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
+        """Displacement of static background points at random times, by a robust loss (eq. 12)."""
         count, known = self.config.deformation.background_points, self.background_points
         points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
         first, last = self.frame.times or (0.0, 0.0)
@@ -237,7 +237,7 @@ class Nerfies(FieldMethod):
 
     @torch.no_grad()
     def follow(self, points: Points, start: float, end: float) -> Points:
-        """Positions at one moment of surface points of another: those with the same canonical position."""
+        """Positions at one time of surface points of another: those with the same canonical position."""
         motion = self.network.motion
         if motion is None:
             return points

@@ -19,7 +19,7 @@ def elastic_loss(jacobian: Matrix, scale: float) -> Values:
 
 
 def geman_mcclure(square: Float[Tensor, "*n"], scale: float) -> Float[Tensor, "*n"]:
-    """2 (x / c)^2 / ((x / c)^2 + 4), of squares x^2 (Geman and McClure 1985): what is far off pulls no harder."""
+    """2 (x / c)^2 / ((x / c)^2 + 4), of squares x^2 (Geman and McClure 1985): bounded for outliers."""
     relative = square / scale**2
     return 2 * relative / (relative + 4)
 

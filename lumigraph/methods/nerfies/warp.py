@@ -63,10 +63,10 @@ class MomentCodes(Part):
 
 
 class MotionField(Part):
-    """Canonical positions of points at a moment: a screw motion of each (Park 2021, eqs. 4 to 7), or a translation.
+    """Canonical positions of points at a time: a screw motion of each (Park 2021, eqs. 4 to 7), or a translation.
 
-    bands:  m, of the encoding, which join from coarse to fine over a share `annealing` of the budget (section 3.5)
-    alpha:  of them that are there
+    bands:  m, of the encoding, annealed from coarse to fine over a share `annealing` of the budget (section 3.5)
+    alpha:  number of active bands
     """
 
     alpha: Tensor
@@ -101,8 +101,8 @@ class MotionField(Part):
     def inverse(
         self, canonical: Float[Tensor, "point 3"], code: Float[Tensor, "point code"], start: Tensor, steps: int = 20
     ) -> Float[Tensor, "point 3"]:
-        """Points that lie at canonical positions, by fixed-point iteration from a start: each step undoes the motion of
-        the last result, which is exact where neighbours move alike."""
+        """Points with given canonical positions, by fixed-point iteration from a start: each step inverts the motion at
+        the last result, which is exact for locally constant motion."""
         x = start
         for _ in range(steps):
             x = unmoved(canonical, self.network(self.space.warp(x), code, window(self.bands, self.alpha)))
@@ -110,8 +110,8 @@ class MotionField(Part):
 
 
 class SliceField(Part):
-    """Ambient coordinates of points at a moment: the slice of a space of more dimensions that the scene is then (Park
-    2021b, HyperNeRF, section 4.2), for what changes its topology."""
+    """Ambient coordinates of points at a time: a slice of a higher-dimensional canonical space (Park 2021b, HyperNeRF,
+    section 4.2), for changes of topology."""
 
     def __init__(self, space: Space, bands: int, code: int, shape: tuple[int, int, int], dimensions: int):
         super().__init__()
@@ -126,7 +126,7 @@ class SliceField(Part):
 
 
 def moved(points: Float[Tensor, "point 3"], motion: Float[Tensor, "point number"]) -> Float[Tensor, "point 3"]:
-    """Points after motions: translations v, or screw motions (r, v) as the exponential map has them.
+    """Points after motions: translations v, or screw motions (r, v) by the exponential map.
 
     x' = R x + G v      R = 1 + a [r] + b [r]^2      G = 1 + b [r] + c [r]^2
     a = sin t / t      b = (1 - cos t) / t^2      c = (t - sin t) / t^3      t = |r|

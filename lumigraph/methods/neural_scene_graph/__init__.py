@@ -61,9 +61,9 @@ class Config:
 class NeuralSceneGraph(FieldMethod):
     """A background field, one field per class with a latent code per instance, and nodes: boxes with poses over time.
 
-    shown_nodes: things as they are shown: those of the tracks, after edits
-    edits:       that made them
-    found:       tracks and codes of instances that were found in another scene's photographs
+    shown_nodes: rendered nodes: those of the tracks, after edits
+    edits:       the edits
+    found:       tracks and codes of instances fitted to another scene's photographs
     """
 
     Config, learning_rate, accepts = Config, held_decay, (Scene, TrackEdits)
@@ -118,7 +118,7 @@ class NeuralSceneGraph(FieldMethod):
         return (*self.frame.tracks, *self.found[0])
 
     def arrange(self) -> None:
-        """Nodes and their poses by the edits and the settings."""
+        """Set nodes and their poses by the edits and the settings."""
         chosen = []
         for track, control in self.instances.items():
             name, other, share = blend(str(self.settings.get(control, track)))
@@ -134,14 +134,14 @@ class NeuralSceneGraph(FieldMethod):
 
     @property
     def table(self) -> PoseTable:
-        """Given poses of the nodes that are shown, on the method's device."""
+        """Given poses of the rendered nodes, on the method's device."""
         if self._table.times.device != self.device:
             self._table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
         return self._table
 
     @property
     def instances(self) -> dict[str, str]:
-        """Names of the controls of all instances, by the names of these."""
+        """Control names of all instances, by instance name."""
         names: dict[str, str] = {}
         for track in self.tracks:
             name = re.sub(r"\W", "_", track.name)
@@ -150,7 +150,7 @@ class NeuralSceneGraph(FieldMethod):
         return names
 
     def shown_codes(self) -> Float[Tensor, "node code"]:
-        """The latent code of each node, between two where a control says so."""
+        """The latent code of each node, interpolated by its control."""
         known = {track.name: i for i, track in enumerate(self.tracks)}
         codes = torch.cat([self.codes, self.found[1].to(self.codes)])
         rows = []
@@ -167,7 +167,7 @@ class NeuralSceneGraph(FieldMethod):
         return list(self.classes)  # type: ignore[arg-type]
 
     def class_of(self, node: GraphNode) -> int:
-        """Number of the class of a node's looks."""
+        """Class number of a node's appearance."""
         return self.categories.index(next(track.category for track in self.tracks if track.name == node.like))
 
     def moments(self, rays: Rays) -> Float[Tensor, " ray"]:
@@ -280,7 +280,7 @@ class NeuralSceneGraph(FieldMethod):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """The moment, and for each instance whose looks it has."""
+        """The time, and a control of each instance's appearance."""
         own = []
         for track in self.tracks:
             alike = [other.name for other in self.tracks if other.category == track.category and other != track]
@@ -291,8 +291,8 @@ class NeuralSceneGraph(FieldMethod):
         return *super().controls, *times, *own
 
     def given(self, *evidence: Any, **controls: Value) -> NeuralSceneGraph:
-        """The same graph after edits, with controls, or with the instances that the photographs of a scene show beside
-        those that are known: their codes are found, and nothing else is learnt."""
+        """The same graph after edits, with controls, or with a scene's new instances added: only their codes are fitted
+        to its photographs."""
         told = super().given(*(x for x in evidence if not isinstance(x, Scene | TrackEdits)), **controls)
         assert isinstance(told, NeuralSceneGraph)
         for piece in evidence:
@@ -305,10 +305,10 @@ class NeuralSceneGraph(FieldMethod):
 
 
 def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ...], Float[Tensor, "track code"]]:
-    """Tracks of a scene that a graph does not know, in the graph's frame, and codes that show its photographs.
+    """Tracks of a scene that are new to a graph, in the graph's frame, and their codes fitted to its photographs.
 
-    Codes begin at the mean of their class; only these learn. Raises LumigraphError for a scene without new tracks of a
-    known class.
+    Codes start at the mean of their class; only these are optimised. Raises LumigraphError for a scene without new
+    tracks of a known class.
     """
     place = method.frame.to_source.inverse @ scene.frame.to_source
     known = {track.name for track in method.tracks}

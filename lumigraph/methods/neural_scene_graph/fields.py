@@ -49,8 +49,8 @@ class NetworkClassField(LatentField):
 
 class HashClassField(HashField):
     """A hash table over the box and two small networks. The latent code scales the table's features and is an input of
-    the first network, so that instances share what they have in common and differ in detail. The second one has no
-    code, so that instances share how they are lit."""
+    the first network, so that instances share common features and differ in detail. The second one has no code, so that
+    instances share their lighting."""
 
     deforms = True
 

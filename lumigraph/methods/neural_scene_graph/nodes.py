@@ -71,8 +71,8 @@ class PoseTable:
             setattr(self, name, value.to(device))
 
     def at(self, times: Float[Tensor, " moment"], twist: Float[Tensor, "track key 6"] | None = None) -> Poses:
-        """Poses at moments. twist: corrections, a turn about the scene's axes in radians and a shift in lengths of the
-        box, at the given moments"""
+        """Poses at times. twist: corrections, a rotation about the scene's axes in radians and a translation in lengths
+        of the box, at the given times"""
         nodes, last = len(self.size), self.counts[:, None] - 1
         t = times.expand(nodes, -1).contiguous()
         upper = torch.minimum(torch.searchsorted(self.times, t, right=True).clamp_min(1), last.clamp_min(0))

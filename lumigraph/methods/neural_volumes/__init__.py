@@ -125,7 +125,7 @@ class NeuralVolumes(RayMethod):
         return torch.lerp(self.encoded(before)[0], self.encoded(after)[0], share)
 
     def volume_at(self, time: float, toward: Float[Tensor, " 3"]) -> Decoded:
-        """A moment as pictures show it; the last one is kept."""
+        """Decoded volume of a time for renderings; the last one is cached."""
         key = time, toward.tolist() if self.config.view_dependence else None, self.encoder.mean.weight._version
         if self.decoded[0] != key:
             code = self.code_at(time)
@@ -141,7 +141,7 @@ class NeuralVolumes(RayMethod):
     def march(
         self, rays: Rays, volume: Decoded, generator: torch.Generator | None = None
     ) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Light, opacity and mean distance of rays through a volume (eq. 3): opacity adds up along a ray, to 1 at most.
+        """Colour, opacity and mean distance of rays through a volume (eq. 3): opacity accumulates along a ray, up to 1.
 
         alpha(t) = min(integral of V_alpha, 1)      C = integral of V_rgb d alpha
         """

@@ -1,4 +1,4 @@
-"""Cameras of a rig: their moments, the pictures that are encoded, and what each sees behind the volume."""
+"""Cameras of a rig: their times, the encoded pictures, and the background of each."""
 
 from __future__ import annotations
 
@@ -76,11 +76,11 @@ class Rig(Part):
 
 
 class Backgrounds(Part):
-    """Behind the volume: a picture for each camera of the rig, by the direction of a ray in the camera, and a gain for
-    its colours. Cameras that are not of the rig see the mean.
+    """Backgrounds: a picture for each camera of the rig, by the direction of a ray in the camera, and a gain for its
+    colours. Other cameras get the mean.
 
-    row:    camera of each photograph, by which it was first taken; -1 for one that is not of the rig
-    turn:   world to camera, of each; extent: tangents of its half angles of view
+    row:    camera of each photograph in the first frame; -1 for one outside the rig
+    turn:   rotation from world to camera, of each; extent: tangents of its half angles of view
     """
 
     row: Tensor
@@ -147,14 +147,14 @@ class Backgrounds(Part):
 
 
 def cameras_of(data: Scene) -> Int[Tensor, " photograph"]:
-    """The first photograph with the pose of each: the number of its camera."""
+    """Camera number of each photograph: the first photograph with the same pose."""
     poses = data.cameras.pose.flatten(1)
     same = (poses[:, None] - poses[None]).abs().amax(-1) < SAME_POSE
     return same.int().argmax(1)
 
 
 def spread(position: dict[int, Tensor], count: int) -> list[int]:
-    """Cameras that lie far apart, the first one first; some of them twice where there are few."""
+    """Farthest-point sampling of cameras from the first one; repeats some if there are few."""
     names, places = list(position), torch.stack(list(position.values()))
     chosen = [0]
     while len(chosen) < min(count, len(names)):

@@ -28,7 +28,7 @@ CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
 
 class Decoded(NamedTuple):
-    """A moment. rough: opacity on a coarse lattice, and where it is faint nothing is looked up; None: all is"""
+    """Decoded volume of a time. rough: opacity on a coarse lattice, which skips faint regions; None: no skipping"""
 
     code: Code
     volume: Volume
@@ -45,7 +45,7 @@ def dense(*widths: int) -> nn.Sequential:
 
 
 def scaled(layer: nn.Module, last: bool = False) -> nn.Module:
-    """Glorot's weights (2010) for the slope of what follows, zero biases. last: nothing follows"""
+    """Glorot initialisation (2010) for the slope of the next activation, zero biases. last: no activation follows"""
     gain = 1.0 if last else nn.init.calculate_gain("leaky_relu", SLOPE)
     nn.init.xavier_uniform_(layer.weight, gain)  # type: ignore[arg-type]
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
@@ -187,8 +187,8 @@ class VolumeDecoder(nn.Module):
     def look_up(
         self, decoded: Decoded, places: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Opacity per unit and colour at places: of the template where the whole's map and the warp lead; nothing
-        outside of [-1, 1]^3."""
+        """Opacity per unit and colour at points: of the template at their positions under the global affine map and the
+        warp; zero outside of [-1, 1]^3."""
         inside = (places.abs() <= 1).all(-1)
         if decoded.rough is None:
             found = sampled(decoded.volume, self.warped(decoded, places))
@@ -199,7 +199,7 @@ class VolumeDecoder(nn.Module):
         return found[:, 3], found[:, :3]
 
     def warped(self, decoded: Decoded, places: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Places of the template to which the map of the whole and the warp lead."""
+        """Positions in the template under the global affine map and the warp."""
         there = self.whole(decoded.code, places)[0]
         return there if decoded.warp is None else sampled(decoded.warp, there)
 
@@ -217,7 +217,7 @@ def opacity_roughness(volume: Volume) -> Float[Tensor, ""]:
 
 
 def opacity_prior(opacity: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
-    """Least where rays are opaque or clear: the logarithm of a beta distribution (section 5.4)."""
+    """Smallest for opaque or clear rays: the logarithm of a beta distribution (section 5.4)."""
     return ((0.1 + opacity).log() + (1.1 - opacity).log() - CLEAR).mean()
 
 

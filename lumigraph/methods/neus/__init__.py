@@ -139,7 +139,7 @@ class NeuS(FieldMethod):
         return self.network.distance(points)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """Rendering of each ray, with the normals that it meets in its extras: unit length, 0 where nothing is."""
+        """Rendering of each ray, with unit normals of intersections in its extras, 0 without one."""
         (seen,) = self.sampler.sample(rays, self.network)
         look, (gradient, *_) = self._look(seen, rays), seen.features
         behind = self.behind(rays, None, background)
@@ -147,7 +147,7 @@ class NeuS(FieldMethod):
         return found.with_extra(normals=normalize(found.extra["normals"], dim=-1))
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """Find the first sphere, and what is empty."""
+        """Initialise the sphere and the mask of empty space."""
         self.network.shape.begin_as(*first_sphere(data))
         super().begin(data, seconds)
 
@@ -176,7 +176,7 @@ class NeuS(FieldMethod):
         return terms
 
     def _anywhere(self, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-        """Random points of the box: sections that are left out learn no eikonal term."""
+        """Random points of the box, for the eikonal term in skipped sections."""
         low, high = self.network.box
         return torch.lerp(low, high, torch.rand(count, 3, generator=generator).to(low))
 
@@ -191,7 +191,7 @@ class NeuS(FieldMethod):
         return [torch.optim.Adam([{"params": others}, sharpness], c.learning_rate)]
 
     def learning_rate(self, step: int, progress: float) -> float:
-        """Even growth, then down along a cosine (the release's schedule)."""
+        """Linear warm-up, then cosine decay (the release's schedule)."""
         c, first = self.config, self.config.warmup
         if progress < first:
             return c.learning_rate * progress / first
@@ -200,7 +200,7 @@ class NeuS(FieldMethod):
 
 
 def eikonal(gradient: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
-    """Mean square of what the gradient's length lacks to 1 (eq. 17)."""
+    """Mean squared deviation of the gradient's length from 1 (eq. 17)."""
     return (gradient.norm(dim=-1) - 1).square().mean()
 
 
@@ -210,12 +210,11 @@ def mask_error(opacity: Float[Tensor, " ray"], alpha: Float[Tensor, " ray"]) -> 
 
 
 def first_sphere(data: Scene) -> tuple[Float[Tensor, " 3"], float, bool]:
-    """Centre and radius of the sphere that the distance begins as, and whether it is hollow.
+    """Centre and radius of the initial sphere, and whether it is hollow.
 
-    Half as large as the ball around what is known to matter: the visual hull of photographs with alpha, or the sparse
-    points in the box of interest, or that box. It fits between the planes that are closest around that, and no camera
-    is near it, for one inside would show nothing but black. Where most cameras are in the box, it holds a room, and the
-    sphere is hollow.
+    Half the radius of the ball around the visual hull of photographs with alpha, or the sparse points in the box of
+    interest, or that box. It fits between the closest planes around that, and no camera is near it, for one inside
+    would render only black. If most cameras are in the box, that is a room, and the sphere is hollow.
     """
     low, high = torch.tensor(data.frame.bounds)
     stands = data.cameras[data.splits["train"]].position.cpu()

@@ -45,8 +45,8 @@ class Surface(NamedTuple):
 
     distance:  f, scene units, negative inside
     gradient:  of the distance by the point
-    features:  what colour takes
-    laplacian: sum of second derivatives; None where it is not known
+    features:  inputs of the colour network
+    laplacian: sum of second derivatives; None if unknown
     """
 
     distance: Float[Tensor, " point"]
@@ -74,7 +74,7 @@ class DistanceField(nn.Module, ABC):
         self.register_buffer("sign", torch.tensor(1.0))
 
     def begin_as(self, centre: Float[Tensor, " 3"], radius: float, hollow: bool) -> None:
-        """Take the sphere to begin as, ahead of the first step."""
+        """Set the initial sphere, before the first step."""
         self.centre.copy_(centre)
         self.radius.fill_(radius)
         self.sign.fill_(-1.0 if hollow else 1.0)
@@ -164,14 +164,14 @@ def geometric(layer: nn.Linear, waves: int) -> nn.Linear:
 
 
 class HashDistance(DistanceField):
-    """A sphere's distance and what a hash table adds to it.
+    """Signed distance to a sphere plus a hash table's correction.
 
         f(x) = sign (|x - centre| - radius) + g(x)
 
     The gradient is numerical (Li 2023, Neuralangelo, section 3.2): the kernel of the hash table has no second
-    derivative, and differences over a cell reach the entries of its neighbours too. Differences of four corners of a
-    tetrahedron do (instead of six along the axes). Their mean gives the Laplacian. The step is a cell of the finest
-    level that has joined.
+    derivative, and differences over a cell also reach its neighbours' entries. Differences at the four corners of a
+    tetrahedron suffice (instead of six along the axes). Their mean gives the Laplacian. The step is a cell of the
+    finest active level.
     """
 
     corners: Tensor
@@ -192,11 +192,11 @@ class HashDistance(DistanceField):
         return 2 * EXTENT / levels.resolutions[finest - 1]
 
     def begun(self, points: Points) -> Float[Tensor, " point"]:
-        """Distance to the sphere."""
+        """Distance to the initial sphere."""
         return self.sign * ((points - self.centre).norm(dim=-1) - self.radius)
 
     def added(self, encoded: Float[Tensor, "point width"]) -> Float[Tensor, " point"]:
-        """Values of the table behind its network, without features."""
+        """Correction g(x) of the table and its network, without features."""
         *hidden, last = self.table.density_network.weights
         return kernels.perceptron(encoded, *hidden, last[:1].contiguous())[:, 0]
 
@@ -280,7 +280,7 @@ class NeuSField(Field):
     # At points
 
     def distance(self, points: Points) -> Float[Tensor, " point"]:
-        """Signed distance in scene units; beyond the box that of its nearest point and the way there."""
+        """Signed distance in scene units; outside the box that of its nearest point plus the distance to it."""
         within = self.within(points)
         return self.shape.distance(within) + (points - within).norm(dim=-1)
 
@@ -293,7 +293,7 @@ class NeuSField(Field):
         return self.sharpness * torch.sigmoid(-self.sharpness * distance)
 
     def density_at(self, coordinates: Points) -> Densities:
-        """Density for a mask of empty space: no further from the surface than the margin, space counts as full."""
+        """Density for a mask of empty space: maximal within the margin around the surface."""
         return self.facing_density(self.shape.distance(coordinates) - self.margin)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, tuple[Points]]:

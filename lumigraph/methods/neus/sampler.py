@@ -119,8 +119,8 @@ class SectionSampler(Sampler):
     def distance(
         self, field: NeuSField, rays: Rays, t: Float[Tensor, "ray place"], spacing: Float[Tensor, " ray"]
     ) -> Float[Tensor, "ray place"]:
-        """Signed distance at places on rays; what stands for it where nothing can be is the distance between even
-        places, so that it falls no faster than a distance does."""
+        """Signed distance at points on rays; in empty space its placeholder is the distance between equal steps, so
+        that it falls no faster than a distance does."""
         points = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).view(-1, 3)
         there = self.empty.may_hold(points)
         if there is None:
@@ -131,8 +131,8 @@ class SectionSampler(Sampler):
 
     @torch.no_grad()
     def beyond(self, rays: Rays, light: Float[Tensor, " ray"], generator: torch.Generator | None) -> Samples:
-        """Samples behind the box, even in disparity; those of a ray that misses it begin where it is nearest to the
-        middle. Rays without any light left have none."""
+        """Samples behind the box, linear in disparity; a ray that misses it starts at its closest point to the centre.
+        None for rays without transmittance."""
         assert self.around is not None
         space, count = self.around
         near, far = self.space.interval(rays)
@@ -154,8 +154,8 @@ class SectionSampler(Sampler):
 def section_weights(
     field: NeuSField, t: Float[Tensor, "ray place"], distance: Float[Tensor, "ray place"], sharpness: float | None
 ) -> Float[Tensor, "ray section"]:
-    """Weights of the sections between places. The slope is the steeper of a section and the one before it: so one that
-    begins just inside has weight too, and it is no steeper than that of a distance."""
+    """Weights of the sections between points on rays. The slope is the steeper of a section and the previous one, so
+    that one that begins just inside has weight too, limited to a distance's slope."""
     length = t[:, 1:] - t[:, :-1]
     slope = (distance[:, 1:] - distance[:, :-1]) / length.clamp_min(1e-6)
     before = torch.nn.functional.pad(slope[:, :-1], (1, 0))
@@ -174,5 +174,5 @@ def in_order(first: Samples, second: Samples) -> tuple[Samples, Tensor]:
 
 
 def padded(values: Tensor, count: int) -> Tensor:
-    """Rows followed by so many zeros."""
+    """Rows padded with zeros."""
     return torch.cat([values, values.new_zeros(count, *values.shape[1:])])

@@ -125,18 +125,18 @@ class NGLOD(SurfaceMethod):
 
     @property
     def level(self) -> tuple[int, float]:
-        """The level that is shown, counted from 0, and the share of the next one in it."""
+        """The rendered level, counted from 0, and the share of the next one in it."""
         shown = float(self.control("level")) - 1 if self.config.levels > 1 else 0.0
         whole = min(int(shown), self.config.levels - 1)
         return whole, shown - whole
 
     def level_bytes(self, level: int) -> int:
-        """Bytes of what a level of detail needs, counted from 1."""
+        """Bytes of a level of detail, counted from 1."""
         return self.octree.bytes_at(level - 1)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Signed distance at the shown level: (1 - alpha) d_L + alpha d_L+1 (section 3.2). Beyond the cube, that of its
-        nearest point and the way there."""
+        """Signed distance at the rendered level: (1 - alpha) d_L + alpha d_L+1 (section 3.2). Outside the cube, that of
+        its nearest point plus the distance to it."""
         within = points.clamp(-1, 1)
         number, share = self.level
         found = self.octree.distance(within, number)
@@ -147,7 +147,7 @@ class NGLOD(SurfaceMethod):
     # Along rays
 
     def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
-        """Sphere tracing inside of the cells that rays cross (section 3.3); a ray skips what lies between them."""
+        """Sphere tracing within the cells that rays cross (section 3.3), skipping the space between them."""
         if self.device.type == "cpu" and not self.level[1]:
             return self._traced_by_loops(rays)
         with torch.no_grad():
@@ -191,7 +191,7 @@ class NGLOD(SurfaceMethod):
 
 
 class Spans:
-    """Intervals of rays in cells, to enter again at any distance."""
+    """Intervals of rays in cells, with lookup at any distance."""
 
     def __init__(self, found: Crossed):
         self.start, self.end, self.ray_starts = 2 * found.t_start, 2 * found.t_end, found.ray_starts
@@ -200,7 +200,7 @@ class Spans:
         self.keys = self.end.double() + self.apart * ray.double()
 
     def enter(self, row: Int[Tensor, " ray"], t: Float[Tensor, " ray"]) -> tuple[Float[Tensor, " ray"], Tensor, Tensor]:
-        """The first place at or behind t in an interval of each ray, whether there is one, and whether it is farther
+        """The first point at or behind t in an interval of each ray, whether there is one, and whether it is farther
         than t."""
         number = torch.searchsorted(self.keys, t.double().clamp(max=self.apart) + self.apart * row.double())
         inside = number < self.ray_starts[row + 1]

@@ -19,7 +19,7 @@ HALF = np.float32(0.5)
 
 @njit(inline="always")
 def within(x, low):
-    """The share of a cell's side that lies below a coordinate."""
+    """Position of a coordinate in a cell, as a share of its side."""
     return min(max(x - np.float32(low), ZERO), ONE)
 
 

@@ -60,7 +60,7 @@ class LevelCells(nn.Module):
 
     @property
     def made(self) -> tuple[Int[Tensor, " place"], Nodes, Tree]:
-        """Row of each place of the dense grid, rows of corners, and the octree for rays: made when first asked for."""
+        """Row of each cell of the dense grid, rows of corners, and the octree for rays: built on first use."""
         made = self._made
         if made is None or made[0] is not self.rows or made[1] != self.rows._version:
             n, rows = self.resolution, self.rows
@@ -85,7 +85,7 @@ class Level(nn.Module):
         self.decoder = MLP(features + 3, hidden_width, 1)
 
     def fill(self, rows: Int[Tensor, "cell 2"], generator: torch.Generator) -> None:
-        """Take these cells, with random features at their corners."""
+        """Set the cells, with random features at their corners."""
         self.cells.rows = rows.int().to(self.features.device)
         drawn = torch.randn(len(self.cells.corners), self.features.shape[1], generator=generator)
         self.features.data = (FIRST_FEATURES * drawn).to(self.features.device)
@@ -102,7 +102,7 @@ class Level(nn.Module):
 
 
 class CodeOctree(nn.Module):
-    """Levels from coarse to fine. All cells of the first are there; of the others, those that the surface may pass."""
+    """Levels from coarse to fine. The first has all cells; the others have those that may contain the surface."""
 
     levels: Any  # a ModuleList of Level
 
@@ -117,7 +117,7 @@ class CodeOctree(nn.Module):
         return len(self.levels)
 
     def fill(self, shape: Shape, generator: torch.Generator) -> None:
-        """Divide cells again and again where the surface of a shape may pass through them."""
+        """Subdivide cells that may contain the surface of a shape."""
         first = self.levels[0].cells.resolution
         cells = torch.cartesian_prod(*[torch.arange(first)] * 3)
         near, _ = passed(shape, cells, first)
@@ -150,8 +150,8 @@ class CodeOctree(nn.Module):
     def distance(self, points: Float[Tensor, "point 3"], last: int) -> Float[Tensor, " point"]:
         """Signed distance at a level, counted from 0, in [-1, 1]^3.
 
-        The surface lies in that level's cells. In space that they leave out, the decoder of the finest cell around a
-        point gives the size and the octree the sign: no decoder has learnt what lies outside of its cells.
+        The surface lies in that level's cells. In the space outside them, the decoder of the finest cell around a point
+        gives the size and the octree the sign: no decoder is trained outside of its cells.
         """
         out, held, summed = points.new_zeros(len(points)), None, None
         for number, level in enumerate(self.levels[: last + 1]):

@@ -41,7 +41,7 @@ NEIGHBOURS = 2.0  # falloff of smoothness with distance between samples, per uni
 
 @dataclass(frozen=True)
 class FlowNumbers:
-    """A Config's numbers of scene flow; the release's (config_kid-running), which the paper's section 3 explains."""
+    """A Config's parameters of scene flow; the release's (config_kid-running), explained in section 3 of the paper."""
 
     neighbours: Annotated[int, between(0, 2)] = 2  # moments to either side that are warped; 0: time is a mere input
     both_ways: bool = True  # warp forward and back in each step; off: one of them at random, in half the time
@@ -64,7 +64,7 @@ class Config:
 
 
 class Hop(NamedTuple):
-    """Samples of rays, carried to another moment, as the dynamic field shows them there.
+    """Samples of rays, warped to another time, with the dynamic field there.
 
     places, time: of the samples; motion: raw, of the dynamic field there
     """
@@ -77,7 +77,7 @@ class Hop(NamedTuple):
 
 
 class NSFF(FieldMethod):
-    """Two fields: one stands still, and one knows for each point and moment where it was and where it goes."""
+    """A static field, and a dynamic one with forward and backward scene flow at each point and time."""
 
     Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: BlendedField
@@ -167,8 +167,8 @@ class NSFF(FieldMethod):
         return data.sample_rays(self.sampler.batch_size, generator, places=True).to(self.device)
 
     def before_step(self, step: int, progress: float) -> None:
-        """The weights of flow and depth fall to a tenth each time; from the first fall on, warps go on to the second
-        neighbour."""
+        """Weights of flow and depth decay by a factor of ten each time; from the first decay on, warps reach the
+        second neighbour."""
         falls = int(progress / self.config.flow.prior_interval)
         self.prior_scale, self.chains = PRIOR_FALL**-falls, falls > 0 and self.config.flow.neighbours > 1
         super().before_step(step, progress)
@@ -218,13 +218,13 @@ class NSFF(FieldMethod):
         return forward, back
 
     def toward(self, motion: Float[Tensor, "sample 8"], way: Int[Tensor, " sample"]) -> tuple[Tensor, Tensor]:
-        """Flow and disocclusion weight of samples, each of its own way: 1 to the next moment, 0 to the one before."""
+        """Flow and disocclusion weight of samples, each in its direction: 1 to the next time, 0 to the previous one."""
         forward, back = self.flows(motion)
         ahead = way[:, None] > 0
         return torch.where(ahead, forward, back), torch.where(ahead, motion[:, 6:7], motion[:, 7:8]).sigmoid()
 
     def hop(self, start: Hop, way: Int[Tensor, " sample"], time: Tensor, directions: Directions) -> tuple[Hop, Tensor]:
-        """Samples at a neighbouring moment, and their disocclusion weights on the way. time: code of that moment"""
+        """Samples at a neighbouring time, and their disocclusion weights towards it. time: code of that time"""
         flow, weight = self.toward(start.motion, way)
         places = self.space.unwarp(self.space.warp(start.places) + flow)
         density, features = self.network.dynamic.geometry(places, time)
@@ -242,8 +242,8 @@ class NSFF(FieldMethod):
         target: Float[Tensor, "ray 3"],
         background: Float[Tensor, "#ray 3"],
     ) -> dict[str, Tensor]:
-        """Photometric consistency (eqs. 4 to 6), cycle consistency (eq. 7) and optical flow (eq. 8) of rays that are
-        carried to a neighbouring moment, each its own way, and on to the second neighbour."""
+        """Photometric consistency (eqs. 4 to 6), cycle consistency (eq. 7) and optical flow (eq. 8) of rays warped to a
+        neighbouring time, each in its direction, and on to the second neighbour."""
         c, ray = self.config.flow, packed.ray_index
         count = int(self.known_moments.isfinite().sum())
         index = torch.searchsorted(self.known_moments, self.moments(batch.rays).contiguous()).clamp(max=count - 1)
@@ -274,9 +274,9 @@ class NSFF(FieldMethod):
         return terms
 
     def flow_error(self, batch: Batch, way: Int[Tensor, " ray"], known: Tensor, own: Rendering) -> Float[Tensor, ""]:
-        """Pixels between where scene flow and where optical flow lead (eq. 8), of pictures 288 rows high.
+        """Distance in pixels between projected scene flow and optical flow (eq. 8), of pictures 288 rows high.
 
-        own: of the dynamic field at the rays' moment; its extra `place` is where its samples go
+        own: of the dynamic field at the rays' time; its extra `place` is the displaced position of its samples
         """
         goal, image = self.priors.flow_targets(batch, way)
         sure = (known & (own.opacity > MIN_OPACITY) & goal.isfinite().all(-1) & (image >= 0)).nonzero()[:, 0]
@@ -305,7 +305,7 @@ class NSFF(FieldMethod):
 
     @torch.no_grad()
     def follow(self, points: Points, start: float, end: float) -> Points:
-        """Positions at one moment of surface points of another, along scene flow from moment to moment."""
+        """Positions at one time of surface points of another, by integrating scene flow."""
         moments = self.known_moments[self.known_moments.isfinite()].tolist()
         if not self.warps or len(moments) < 2:
             return points

@@ -80,7 +80,7 @@ class StaticHash(HashField):
 
 
 class MotionNetwork(SkipNetwork):
-    """Raw flows and weights at points and times: a smooth function, beside a hash table that is none."""
+    """Raw flows and weights at points and times: a smooth network, unlike a hash table."""
 
     def __init__(self, bands: int, depth: int, width: int, skip_layer: int):
         encoding = FrequencyEncoding(4, bands)

@@ -1,4 +1,4 @@
-"""Priors of NSFF from the photographs: optical flow to neighbouring moments, and depth of what stands still."""
+"""Priors of NSFF from the photographs: optical flow to neighbouring times, and depth of static parts."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class MotionPriors(Part):
     """Optical flow from each training photograph to those before and after it, and its depth, in small pictures.
 
     size:    height and width of all small pictures
-    row:     of each photograph among them; -1 for one that is not learnt from
-    partner: photographs at the moment before and after that flow leads to; -1 for none
-    flow:    pixels (x, y) of small pictures, of each row, way and pixel; NaN where it is not sure
-    depth:   along rays, scene units, of each row and pixel; NaN where it is not known
+    row:     of each photograph among them; -1 for held-out ones
+    partner: photographs at the time before and after, targets of the flow; -1 for none
+    flow:    pixels (x, y) of small pictures, of each row, direction and pixel; NaN if unreliable
+    depth:   along rays, scene units, of each row and pixel; NaN if unknown
     taken:   the cameras, as JSON
     """
 
@@ -86,7 +86,7 @@ class MotionPriors(Part):
     def known_depth(
         self, data: Scene, train: list[int], smaller: int, size: tuple[int, int], seconds: float
     ) -> Float[Tensor, "photograph height width"]:
-        """Depth from the capture's layer, or by plane sweeps, which match what stands still alone."""
+        """Depth from the capture's layer, or by plane sweeps, which match only static parts."""
         depth = torch.full((len(train), *size), math.nan, dtype=torch.half)
         if self.source == "files":
             for i, number in enumerate(train):
@@ -113,9 +113,9 @@ class MotionPriors(Part):
         return Camera(pose, lens, size).to(self.row.device)
 
     def flow_targets(self, batch: Batch, way: Int[Tensor, " ray"]) -> tuple[Float[Tensor, "ray 2"], Tensor]:
-        """Pixels at which other photographs show what rays see, NaN where that is not known, and their numbers.
+        """Optical-flow targets of rays in other photographs, pixels, NaN if unknown, and the photographs' numbers.
 
-        way: 0 for the moment before, 1 for the one after
+        way: 0 for the time before, 1 for the one after
         """
         image, sizes = batch.rays.image_index, self.cameras.size[batch.rays.image_index]
         row, within = self.cells(batch)
@@ -165,7 +165,7 @@ def bytes_of(photograph: Photograph) -> UInt8[Tensor, "height width 3"]:
 def checked_flow(
     first: UInt8[Tensor, "height width 3"], second: UInt8[Tensor, "rows columns 3"]
 ) -> Float[Tensor, "height width 2"]:
-    """Optical flow from one picture to another, NaN where the way back leads elsewhere."""
+    """Optical flow from one picture to another, NaN where forward-backward consistency fails."""
     if first.shape != second.shape:
         second = interpolate(second.movedim(-1, 0)[None].float(), first.shape[:2], mode="area")[0].movedim(0, -1).byte()
     height, width = first.shape[:2]
@@ -178,5 +178,5 @@ def checked_flow(
 
 
 def seen(mask: Bool[Tensor, " ray"], values: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
-    """Mean of values where a mask says so; 0 without any."""
+    """Masked mean of values; 0 for an empty mask."""
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)

@@ -28,7 +28,7 @@ class EvenNumbers:
 
 
 class EvenSampler(Sampler):
-    """So many samples of each ray, even in the coordinates of a space."""
+    """A fixed number of samples of each ray, linear in the coordinates of a space."""
 
     rays_per_chunk = 1024
 

@@ -68,7 +68,7 @@ REGION_DILATION = 2  # cells around, whose soft edge goes along
 
 
 class ObjectNeRF(FieldMethod):
-    """A scene that can be taken apart by the instances of its photographs' masks."""
+    """A scene branch and an object branch, decomposed by the instances of its photographs' masks."""
 
     Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | CoordinateField
@@ -151,7 +151,7 @@ class ObjectNeRF(FieldMethod):
         }
 
     def asked(self, labels: Int[Tensor, " ray"], generator: torch.Generator) -> Int[Tensor, " ray"]:
-        """The instance that each ray teaches: its own, or for half of the rays one of those in the batch."""
+        """The trained instance of each ray: its own, or for half of the rays one of those in the batch."""
         there = labels[labels >= 0].unique()
         if not len(there):
             return torch.zeros_like(labels)
@@ -207,7 +207,7 @@ class ObjectNeRF(FieldMethod):
         return kept(look, ~self.belongs(points, number))
 
     def instance_at(self, rays: Rays, number: int, place: Similarity) -> Look:
-        """The object branch of one instance, inside its box, moved to a place."""
+        """The object branch of one instance, inside its box, under a transform."""
         back = place.inverse
         local = replace(rays, origins=back.points(rays.origins), directions=back.directions(rays.directions))
         numbers = torch.full((len(rays),), number, device=rays.origins.device)
@@ -218,7 +218,7 @@ class ObjectNeRF(FieldMethod):
 
     @torch.no_grad()
     def belongs(self, points: Float[Tensor, "point 3"], number: int) -> Bool[Tensor, " point"]:
-        """True for points that go with an instance: in cells of its box that its branch fills, and in those beside."""
+        """Mask of points in an instance's region: cells of its box that its branch occupies, and neighbouring ones."""
         low, high = self.boxes.box(number)
         sides = ((high - low) / (high - low).max() * REGION_CELLS).ceil().long().clamp_min(1)
         region = self._region(number, low, high, sides)
@@ -255,7 +255,7 @@ class ObjectNeRF(FieldMethod):
         return density if edit is None else self._left(density, points, edit)
 
     def _left(self, density: Densities, points: Points, edit: Edit) -> Densities:
-        """Density after an edit, but for an instance at another place."""
+        """Density after an edit, without a transformed instance."""
         belongs = self.belongs(points, edit.number)
         if edit.kind == ALONE:
             return torch.where(belongs, density, 0.0)

@@ -40,9 +40,9 @@ class ObjectTable(HashField):
 
 
 class SceneWithout(Field):
-    """A scene branch without an instance, so that a sampler looks past where it was.
+    """A scene branch without an instance, so that a sampler passes through its region.
 
-    belongs: true for points that go with the instance
+    belongs: mask of points in the instance's region
     """
 
     def __init__(self, scene: HashField | CoordinateField, belongs: Callable[[Tensor], Tensor]):
@@ -64,7 +64,7 @@ class SceneWithout(Field):
 
 
 class InstanceBoxes(nn.Module):
-    """Boxes of instances, from the surfaces that photographs show of them: a histogram along each axis."""
+    """Boxes of instances, from their visible surface points: a histogram along each axis."""
 
     counts: Tensor
 
@@ -75,7 +75,7 @@ class InstanceBoxes(nn.Module):
 
     @torch.no_grad()
     def add(self, points: Float[Tensor, "point 3"], labels: Int[Tensor, " point"]) -> None:
-        """Count points of surfaces."""
+        """Add surface points to the histograms."""
         low, high = points.new_tensor(self.bounds)
         bins = (BINS * (points - low) / (high - low)).floor().long()
         inside = ((bins >= 0) & (bins < BINS)).all(-1)

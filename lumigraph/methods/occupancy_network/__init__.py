@@ -69,9 +69,9 @@ EVALUATED_POINTS = 1 << 14  # points that go through the decoder together, to st
 
 @dataclass(frozen=True)
 class OccupancyLesson:
-    """Points of some members, as many of each, and what each member's code is encoded from.
+    """Points of some members, as many of each, and the encoder's input for each member.
 
-    plain: members as they are, without a warp
+    plain: members without a warp
     """
 
     unit: ClassVar[str] = "points"
@@ -86,7 +86,7 @@ class OccupancyLesson:
 
 @dataclass(frozen=True)
 class Warp:
-    """x' = scale (x + bend (1 - x^2) / 2) + shift along each axis of each member: other proportions of the same parts.
+    """x' = scale (x + bend (1 - x^2) / 2) + shift along each axis of each member: augmentation of proportions.
 
     It is monotone for |x| < 1 / |bend|, so the inside of a shape stays inside.
     """
@@ -99,7 +99,7 @@ class Warp:
     def drawn(
         box: Float[Tensor, "member 2 3"], bend: Float[Tensor, "member 1 3"], stretch: Float[Tensor, "member 1 3"]
     ) -> Warp:
-        """The warp of these bends and factors after which the longest side of each box is normalised again."""
+        """Warp of given bends and factors, with the longest side of each warped box normalised."""
         low, high = (stretch * bent(box, bend)).split(1, 1)
         size = 2 * HALF_SIDE / (high - low).amax(-1, keepdim=True)
         return Warp(bend, size * stretch, -size * (low + high) / 2)
@@ -182,7 +182,7 @@ class OccupancyNetwork(CodedSurface):
         return Warp.drawn(box.float(), self.config.bend * warped[0], (self.config.stretch * warped[1]).exp())
 
     def _evidence_of(self, shape: Shape, member: int, generator: torch.Generator) -> Float[Tensor, "*evidence"]:
-        """What a training member is encoded from in a step."""
+        """The encoder's input for a training member in a step."""
         c = self.config
         if c.input == "points":
             return shape.surface(c.cloud_points, generator).points
@@ -218,13 +218,13 @@ class OccupancyNetwork(CodedSurface):
     # Shapes
 
     def logits(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Logit of the probability that points are inside of the instance that is shown."""
+        """Logit of the probability that points are inside of the current instance."""
         code = self.code[None]
         return torch.cat([self.decoder(part[None], code)[0] for part in points.split(EVALUATED_POINTS)])
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Logit of the threshold less that of points, as long as if occupancy rose by 1 / VALUE_SCALE: it has the sign
-        and the zero level of a distance, and not its length."""
+        """Logit of the threshold minus that of points, scaled as if occupancy had slope 1 / VALUE_SCALE: sign and zero
+        level of a distance, but not its length."""
         return VALUE_SCALE * (self._level - self.logits(points))
 
     @property
@@ -241,7 +241,7 @@ class OccupancyNetwork(CodedSurface):
 
     @torch.no_grad()
     def find(self, evidence: Any) -> Float[Tensor, " code"]:
-        """The code of a cloud or mesh, or of a picture, which is made of a mesh as in training.
+        """The code of a cloud or mesh, or of a picture, which is rendered from a mesh as in training.
 
         Raises LumigraphError for evidence of another kind than the training's.
         """
@@ -268,9 +268,9 @@ class OccupancyNetwork(CodedSurface):
         return self._through(cloud, self.encoder(cloud[None])[0])
 
     def _through(self, cloud: Float[Tensor, "point 3"], code: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
-        """The code close to an encoded one whose surface passes through a cloud: the threshold's logit at its points.
+        """The encoded code optimised so that the surface passes through a cloud: the threshold's logit at its points.
 
-        The cloud does not say where the shape is empty, so the fit ends after few steps.
+        A cloud has no points in empty space, so the fit ends after few steps.
         """
         learnt = self.codes.rows[self.codes.learnt]
         if len(learnt) < 2 or not self.config.code_steps:

@@ -18,7 +18,7 @@ VOXELS = 32  # voxels a side that the encoder of voxels takes
 def of_cloud(
     block: Any, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
 ) -> Float[Tensor, "member point output"]:
-    """ResNetLayers of the features of points and of their whole cloud, which are multiplied once for each cloud."""
+    """Layers on the features of points and of their whole cloud, which are multiplied once for each cloud."""
     inner = joined(block.first, x.relu(), whole.relu())
     return joined(block.shortcut, x, whole) + block.second(inner.relu())
 
@@ -33,7 +33,7 @@ def joined(
 
 
 class PointEncoder(nn.Module):
-    """PointNet with residual layers: after each the largest of all points' features joins them (appendix A)."""
+    """PointNet with residual layers, each followed by max pooling over points, concatenated to them (appendix A)."""
 
     def __init__(self, code: int, width: int, layers: int = 5):
         super().__init__()

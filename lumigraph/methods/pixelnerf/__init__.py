@@ -93,10 +93,10 @@ class Config:
 
 @dataclass(frozen=True)
 class Sources:
-    """Photographs of one scene as the networks see them.
+    """Encoded photographs of one scene.
 
-    cameras: where they were taken from
-    maps:    for each network, what each cell adds to its blocks; see `ResidualNetwork.prepared`
+    cameras: of the photographs
+    maps:    for each network, each cell's addition to its blocks; see `ResidualNetwork.prepared`
     frame:   the scene's
     """
 
@@ -120,9 +120,9 @@ class SourceLesson:
 
 
 class PixelNeRF(RayMethod):
-    """A point is known by the features where each photograph would show it, and by where it is in that camera's frame.
+    """A radiance field of a point's features in each photograph, and its position in that camera's frame.
 
-    Learns from a Collection; `given` a Scene, it is a field of that scene, seen by the photographs to learn from.
+    Learns from a Collection; `given` a Scene, it is a field of that scene, conditioned on its training photographs.
     """
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
@@ -174,7 +174,7 @@ class PixelNeRF(RayMethod):
         return len(data.splits["train"]) / self.config.members_per_step
 
     def batch(self, data: Collection, generator: torch.Generator) -> SourceLesson:  # type: ignore[override]
-        """Random members; of each as many random photographs to look at, and rays through some others."""
+        """Random members; of each as many random source photographs, and rays through some others."""
         c = self.config
         views = 1 + chance(c.source_views, generator)
         lesson = SourceLesson([], [], [])
@@ -191,7 +191,7 @@ class PixelNeRF(RayMethod):
         return lesson
 
     def loss(self, batch: SourceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
-        """The squared error of both looks, over all members (section 4.2)."""
+        """The squared error of the coarse and fine renderings, over all members (section 4.2)."""
         terms: dict[str, Tensor] = {}
         generator, share = self.random(step), 1 / len(batch.batches)
         for sources, rays, frame in zip(self._seen(batch), batch.batches, batch.frames, strict=True):
@@ -224,7 +224,7 @@ class PixelNeRF(RayMethod):
         return int(float(self.control("views"))) if self.controls else 1
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """A field of a scene, told its photographs to learn from; or the same one, seen by fewer of them."""
+        """A field of a scene, conditioned on its training photographs; or the same one, on fewer of them."""
         scenes = [piece for piece in evidence if isinstance(piece, Scene)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
         assert isinstance(told, PixelNeRF)
@@ -245,7 +245,7 @@ class PixelNeRF(RayMethod):
         return 4 * cells * numbers
 
     def _keeping(self, scene: Scene, most: int) -> KeptPhotographs:
-        """So many of a scene's photographs to learn from, in an order whose every beginning is spread evenly."""
+        """At most `most` training photographs of a scene, in an order with evenly spread prefixes."""
         there = scene.splits["train"]
         chosen = there[spread_out(scene.cameras[there])[:most]].tolist()
         return KeptPhotographs.of([scene.photograph(i) for i in chosen], scene.frame.background, self.encoder.width)
@@ -323,7 +323,7 @@ class PixelNeRF(RayMethod):
     def _again(
         self, shares: Float[Tensor, "ray sample"], weights: Float[Tensor, "ray sample"], generator: Any
     ) -> Float[Tensor, "ray again"]:
-        """Places of the fine samples: by the coarse weights, and around the coarse depth."""
+        """Distances of the fine samples: by the coarse weights, and around the coarse depth."""
         c, count, device = self.config, len(shares), self.device
         evenly = stratified(count, c.fine_samples, generator, device)
         places = [inverse_transform(midpoints(shares), weights[:, 1:-1], evenly)]

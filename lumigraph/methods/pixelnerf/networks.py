@@ -1,7 +1,7 @@
-"""Features of photographs: a residual network, cut after its third stage, whose stages are laid upon one another.
+"""Features of photographs: a residual network, cut after its third stage, with its stages concatenated.
 
 He et al. 2016 (arXiv 1512.03385), table 1, 34 layers; as an encoder of photographs Yu et al. 2021 (arXiv 2012.02190),
-appendix B.1. Modules and tensors are called as in torchvision's ResNet, so that its weights fit.
+appendix B.1. Modules and tensors are named as in torchvision's ResNet, so that its weights fit.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class EncoderBlock(nn.Module):
 
 
 class Frozen(nn.Module):
-    """Batch normalisation by statistics that stay as they are; scale and shift are learnt on."""
+    """Batch normalisation with frozen statistics; scale and shift are trainable."""
 
     running_mean: Tensor
     running_var: Tensor
@@ -116,7 +116,7 @@ def norm(width: int, frozen: bool) -> nn.Module:
 
 
 def finer(x: Float[Tensor, "view channel _ _"], times: int, size: torch.Size) -> Float[Tensor, "view channel _ _"]:
-    """Features between cells, so many to one: cell i of the result lies at i / times. The last ones are held."""
+    """Bilinear upsampling by an integer factor: cell i of the result lies at i / times. The last cells are repeated."""
     x = F.pad(x, (0, 1, 0, 1), mode="replicate")
     height, width = ((n - 1) * times + 1 for n in x.shape[2:])
     x = F.interpolate(x, (height, width), mode="bilinear", align_corners=True)
@@ -128,8 +128,8 @@ def look_up(
     pixels: Float[Tensor, "view point 2"],
     sizes: Float[Tensor, "view 2"],
 ) -> Float[Tensor, "view point channel"]:
-    """Features at places (x, y) on pictures, bilinearly; outside of a picture those at its border. What
-    `torch.nn.functional.grid_sample` gives, in a tenth of its time: a cell's channels lie side by side.
+    """Features at points (x, y) on pictures, bilinear; outside of a picture those at its border. Equal to
+    `torch.nn.functional.grid_sample`, in a tenth of its time: a cell's channels are contiguous.
 
     pixels: pixels' centres lie at +0.5, so that cell (i, j) lies at (2 j + 0.5, 2 i + 0.5)
     sizes:  width and height of each picture, where pictures are padded to one size
@@ -149,7 +149,7 @@ def look_up(
 
 
 class _Sum(torch.autograd.Function):
-    """out[i] = sum over k of weights[i, k] rows[index[i, k]]; backwards each row gathers from all that it was in."""
+    """out[i] = sum over k of weights[i, k] rows[index[i, k]]; backwards each row gathers from all its sums."""
 
     @staticmethod
     def forward(ctx, rows, index, weights):
@@ -184,12 +184,12 @@ class ResidualNetwork(nn.Module):
     """Yu 2021, figure 4 and appendix B.1: blocks per view, the mean over views, then blocks for all.
 
     inputs:   width of a point in a view's frame, encoded
-    features: width of what the view's picture has there; joined to the input of each of the first blocks
+    features: width of the view's features there; joined to the input of each of the first blocks
     width:    of all layers
-    blocks, joined: in all, and how many are per view
+    blocks, joined: number of all blocks, and of those per view
 
-    A feature is joined by a linear layer, and linear layers commute with bilinear interpolation. So `prepared` takes a
-    whole map of features through these layers once, and points look up what they give.
+    A feature is joined by a linear layer, and linear layers commute with bilinear interpolation. So `prepared` maps all
+    features through these layers once, and points interpolate the results.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class ResidualNetwork(nn.Module):
             nn.init.kaiming_normal_(layer.weight)
 
     def prepared(self, features: Float[Tensor, "view row column feature"]) -> Float[Tensor, "view row column joins"]:
-        """Additions of each cell's features to the inputs of the first blocks, end to end."""
+        """Additions of each cell's features to the inputs of the first blocks, concatenated."""
         return self.join(features.flatten(0, 2)).float().unflatten(0, features.shape[:3])
 
     def forward(
@@ -225,7 +225,8 @@ class ResidualNetwork(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """x + W2 max(0, W1 max(0, x)); at first nearly x alone: W2 begins small, where the published code has zeros."""
+    """x + W2 max(0, W1 max(0, x)); W2 starts small, where the published code has zeros, so the block is nearly the
+    identity."""
 
     def __init__(self, width: int, exact: bool):
         super().__init__()

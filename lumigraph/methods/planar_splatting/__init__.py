@@ -52,7 +52,7 @@ class PlaneNumbers:
 
     @property
     def stop(self) -> float:
-        """Transmittance at which the planes of a pixel are finished."""
+        """Transmittance at which the planes of a pixel terminate."""
         return STOPS[self.depth]
 
 
@@ -76,9 +76,9 @@ class Config:
 
 @dataclass(frozen=True)
 class Pair(Photograph):
-    """A photograph, and one that was taken beside it.
+    """A photograph and a neighbouring one.
 
-    other: None where no camera is near
+    other: None without a near camera
     """
 
     other: Photograph | None = None
@@ -147,7 +147,7 @@ class PlanarSplatting(CloudMethod):
             refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, appearance="no")  # fmt: skip
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
-        """The next photograph, and one of those that were taken beside it."""
+        """The next photograph and a neighbouring one."""
         c, seen, train = self.config.planes, super().batch(data, generator), data.splits["train"]
         assert self.cameras is not None and seen.camera.image_index is not None
         index = int((train == seen.camera.image_index.cpu()).nonzero()[0, 0])

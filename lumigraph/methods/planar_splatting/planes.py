@@ -23,8 +23,8 @@ DISC_OPACITY = 0.7  # at first: points that plane sweeps find lie on surfaces
 
 @dataclass(frozen=True)
 class PlaneMaps:
-    """Planes that one camera sees; sums are over a pixel's Gaussians with the weights w_i = a_i T_i of its colour, and
-    end where the light is spent, or behind the median Gaussian.
+    """Planes visible in one camera; sums are over a pixel's Gaussians with the weights w_i = a_i T_i of its colour, up
+    to termination, or to the median Gaussian.
 
     rays:     unit directions of the pixels, in the scene's frame
     normals:  N = sum_i w_i n_i, towards the camera, in the scene's frame
@@ -57,9 +57,9 @@ class PlaneMaps:
 
 
 def plane_maps(cloud: Gaussians, picture: Splatted, camera: Camera, stop: float) -> PlaneMaps:
-    """Plane maps of a cloud of which a camera has a picture.
+    """Plane maps of a cloud from a camera's rendering.
 
-    stop: transmittance at which a pixel is finished; 1/2 for the Gaussians up to the median one
+    stop: transmittance at which a pixel terminates; 1/2 for the Gaussians up to the median one
     """
     rays = camera.rays(camera.pixels()).directions.view(*picture.opacity.shape, 3)
     normals, distance, opacity = picture.composited(*planes(cloud, camera.position[0]), stop)

@@ -125,7 +125,7 @@ class PlenOctrees(FieldMethod):
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """The paper's depth, where photographs have so many pixels: coarser leaves lose detail for good."""
+        """The paper's depth for photographs of a sufficient resolution: coarser leaves lose detail permanently."""
         return replace(cls.preset(device), octree_depth=cls.Config.octree_depth)
 
     @classmethod
@@ -156,8 +156,8 @@ class PlenOctrees(FieldMethod):
         return self.teacher_sampler or self.leaf_sampler
 
     def octree(self, depth: int | None = None) -> Octree:
-        """The scene as an octree, of so many levels at most; what lies deeper is averaged. Raises LumigraphError while
-        it is not baked, and where it does not fit into memory, with the depth that does."""
+        """The scene as an octree with a largest depth; deeper cells are averaged. Raises LumigraphError before baking,
+        and if it exceeds memory, with the depth that fits."""
         leaves = self._leaves()
         ask_for_octree(leaves, depth)
         return (leaves if depth is None or depth >= leaves.tree.depth else leaves.coarser(depth)).octree()
@@ -182,7 +182,7 @@ class PlenOctrees(FieldMethod):
 
     @torch.no_grad()
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
-        """Leave the least important leaves out."""
+        """Prune the least important leaves."""
         weights = importance["leaves.harmonics"]
         kept = most_important(weights, 1 - share)
         self.leaves.keep(kept)
@@ -216,14 +216,14 @@ class PlenOctrees(FieldMethod):
         return self.expected_rays
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Rays of a step. Here the field is baked when its share of the budget is over, for here cameras are known."""
+        """Rays of a step. Bakes the field after its share of the budget, for here cameras are known."""
         if not self.baked and self.progress >= self.config.teacher_share:
             self._bake(data.cameras[data.splits["train"]])
             self.begun.fill_(self.progress)
         return super().batch(data, generator)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
+        """Bake a teacher's density and colour in the cameras' view; from then on leaves are trained."""
         known, chance, numbers = teacher_of(teacher, cameras), self.random(-1), self._baking(cameras)
         mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
         density = density_of(teacher) if can(teacher, HasField) else known.density
@@ -249,7 +249,7 @@ class PlenOctrees(FieldMethod):
         self._leave_field()
 
     def _baking(self, cameras: Camera) -> Baking:
-        """Numbers of baking. The octree is no deeper than what has a cell for each pixel along the largest picture."""
+        """Parameters of baking. The octree is no deeper than a cell for each pixel along the largest picture."""
         c, depth = self.config, math.ceil(math.log2(int(cameras.size.max())))
         return Baking(min(c.octree_depth, max(depth, 1)), c.leaf_points, c.weight_threshold, self.frame.near)
 
@@ -296,7 +296,7 @@ class PlenOctrees(FieldMethod):
         return [table]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
-        """The field's is held, then falls; the leaves' fall from where they begin."""
+        """The field's rate is constant, then decays; the leaves' rate decays from the start of their training."""
         c = self.config
         over = min(progress / max(c.teacher_share, 1e-9), 1.0)
         begun = float(self.begun)

@@ -1,7 +1,7 @@
-"""From a field to an octree: which cells cameras see, how dense they are, what they show (Yu 2021, section 4).
+"""Baking a field into an octree: visible cells, their density and harmonics (Yu 2021, section 4).
 
-A teacher is whatever gives density and colour at points. Where it marches along rays, what it meets there says which
-cells count: what a field holds where it never looks was never learnt.
+A teacher is anything with density and colour at points. If it samples along rays, only cells with samples are baked: a
+field's density in cells without samples is untrained.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ def bake(
     numbers: Baking,
     generator: torch.Generator,
 ) -> None:
-    """Fill leaves with a field's density, as far as cameras see it; harmonics come after.
+    """Fill leaves with a field's density, within the cameras' view; harmonics come after.
 
     density: at points, per scene unit
-    mask:    cells of a lattice over [-1, 1]^3 that may hold something; all where None
-    Raises LumigraphError where nothing is seen, or where so deep an octree does not fit into memory.
+    mask:    possibly occupied cells of a lattice over [-1, 1]^3; None for all
+    Raises LumigraphError if nothing is visible, or if so deep an octree exceeds memory.
     """
     leaves.low, leaves.size = tight_cube(mask, leaves.low.device)
     codes = dense_cells(density, leaves, mask, numbers)
@@ -83,7 +83,7 @@ def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays
 
 
 def met(teacher: Any, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
-    """Cells of a lattice over [-1, 1]^3 in which a teacher's samples weigh something, and those next to them."""
+    """Cells of a lattice over [-1, 1]^3 with weight of a teacher's samples, and neighbouring ones."""
     n = min(MAX_CELLS, 1 << numbers.depth)
     marks = torch.zeros(n**3, dtype=torch.bool, device=teacher.device)
     for _ in range(0, min(RAYS_PER_CELL << 2 * numbers.depth, MAX_MARKING_RAYS), RAYS_PER_CHUNK):
@@ -99,7 +99,7 @@ def met(teacher: Any, cameras: Camera, numbers: Baking, generator: torch.Generat
 def tight_cube(
     mask: Bool[Tensor, "x y z"] | None, device: torch.device
 ) -> tuple[Float[Tensor, " xyz"], Float[Tensor, ""]]:
-    """Corner and side of the smallest cube around all marked cells; the whole where nothing is marked or known."""
+    """Corner and side of the smallest cube around all marked cells; the whole lattice for an empty or missing mask."""
     if mask is None or not mask.any():
         return torch.full((3,), -1.0, device=device), torch.tensor(2.0, device=device)
     places, cell = mask.nonzero(), 2 / len(mask)
@@ -111,8 +111,8 @@ def tight_cube(
 def dense_cells(
     density: Density, leaves: Leaves, mask: Bool[Tensor, "x y z"] | None, numbers: Baking
 ) -> Int[Tensor, " cell"]:
-    """Codes of the smallest cells that a camera could see: where the mask says so, and one side of them stops as much
-    light as the threshold. Coarse cells are divided level by level."""
+    """Codes of the smallest cells that a camera could see: marked by the mask, and with an opacity across one side of
+    at least the threshold. Coarse cells are subdivided level by level."""
     device, size = leaves.low.device, float(leaves.size)
     place = torch.zeros(1, 3, dtype=torch.int64, device=device)
     octants = torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
@@ -143,7 +143,7 @@ def overlapping(mask: Bool[Tensor, "x y z"], low: Float[Tensor, "cell 3"], side:
 
 
 def ask_for_cells(cells: int, basis: int, depth: int, level: int, device: torch.device) -> None:
-    """Raise LumigraphError where so many cells of a level do not fit into memory, with the depth that does."""
+    """Raise LumigraphError if so many cells of a level exceed memory, with the depth that fits."""
     needed = Leaves.bytes_of(cells, basis, learning=True)
     if needed > (free := free_on(device)):
         raise LumigraphError(
@@ -153,7 +153,7 @@ def ask_for_cells(cells: int, basis: int, depth: int, level: int, device: torch.
 
 
 def fill(leaves: Leaves, codes: Int[Tensor, " row"]) -> None:
-    """Leaves of these codes, which hold nothing yet."""
+    """Leaves of these codes, with empty values."""
     leaves.codes = codes.sort()[0].int()
     leaves.densities = nn.Parameter(torch.zeros(len(codes), 1, device=codes.device))
     leaves.harmonics = nn.Parameter(torch.zeros(len(codes), 3 * leaves.basis, device=codes.device))
@@ -168,7 +168,7 @@ def points_in(
 
 
 def averaged_density(leaves: Leaves, density: Density, count: int, generator: torch.Generator) -> None:
-    """Each leaf's, so that it stops as much light over its side as the field does on average over random points."""
+    """Density of each leaf with the same opacity across its side as the field has on average over random points."""
     centres, side = leaves.centres
     for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS_PER_CHUNK // count, 1)):
         points = points_in(centres[rows], side[rows], count, generator)
@@ -190,7 +190,7 @@ def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Gene
 
 
 def averaged_harmonics(leaves: Leaves, geometry: Geometry, count: int, generator: torch.Generator) -> None:
-    """Each leaf's mean over random points, where they are dense more than where they are not."""
+    """Harmonics of each leaf: mean over random points, weighted by density."""
     centres, side = leaves.centres
     for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS_PER_CHUNK // count, 1)):
         points = points_in(centres[rows], side[rows], count, generator)

@@ -1,4 +1,4 @@
-"""Density and harmonics in the cells of an octree that hold something."""
+"""Density and harmonics in the occupied cells of an octree."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from .harmonic_field import SphericalHarmonicsField
 
 
 class Leaves(SphericalHarmonicsField):
-    """The table of an octree's leaves. What a leaf holds is the same everywhere inside of it (Yu 2021, section 4).
+    """The table of an octree's leaves. Values are constant within a leaf (Yu 2021, section 4).
 
-    codes:     of the leaves, rising in memory as they lie in space (see `kernels.Tree`)
-    densities: (row, 1) per scene unit; what is below 0 counts as 0
+    codes:     of the leaves, sorted along the space-filling curve (see `kernels.Tree`)
+    densities: (row, 1) per scene unit; negative values count as 0
     harmonics: (row, 3 basis), before the sigmoid, colours next to each other
-    low, size: corner and side of the cube that is divided, in the scene's frame
+    low, size: corner and side of the root cube, in the scene's frame
     There are none at first.
     """
 
@@ -60,7 +60,7 @@ class Leaves(SphericalHarmonicsField):
 
     @property
     def tree(self) -> Tree:
-        """Made when first asked for, and again where the codes were loaded or moved."""
+        """Tree of the leaves, built on first use, and again after codes were loaded or moved."""
         made = self._made
         if made is None or made[0] is not self.codes or made[1] != self.codes._version:
             made = self._made = self.codes, self.codes._version, Tree.of(self.codes)
@@ -69,7 +69,7 @@ class Leaves(SphericalHarmonicsField):
     # Along rays
 
     def crossed(self, rays: Rays, near: float, stop: float = 0.0) -> Crossed:
-        """The leaves that rays cross, from near to far, until they are spent; distances in scene units."""
+        """Leaves along rays, front to back, until termination; distances in scene units."""
         found = kernels.octree_cells(*self._within(rays), self.tree, self._thickness.detach(), *self._ends(near, stop))
         size = float(self.size)
         return Crossed(found.t_start * size, found.t_end * size, found.ray_starts, found.rows)
@@ -89,7 +89,8 @@ class Leaves(SphericalHarmonicsField):
 
     @torch.no_grad()
     def touched(self, rays: Rays, near: float, stop: float) -> Int[Tensor, " some"]:
-        """Rows that rays cross before they are spent, rising; on a GPU, where looking takes longer, all rows."""
+        """Ascending rows of leaves that rays cross before termination; on a GPU, where finding them takes longer,
+        all rows."""
         if rays.origins.is_cuda:
             return torch.arange(len(self), device=rays.origins.device)
         marks = torch.zeros(len(self), dtype=torch.bool)
@@ -97,7 +98,7 @@ class Leaves(SphericalHarmonicsField):
         return marks.nonzero()[:, 0]
 
     def part(self, rows: Int[Tensor, " some"]) -> Subtree:
-        """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
+        """A small table of some rows, to which a step's sparse gradient is confined."""
         density, harmonics = (embedding(rows, table, sparse=True) for table in (self.densities, self.harmonics))
         return self.tree.part(rows), density, harmonics
 
@@ -115,7 +116,7 @@ class Leaves(SphericalHarmonicsField):
     # At points
 
     def rows_at(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
-        """The row of the leaf that each point is in, -1 where there is none."""
+        """The row of the leaf that contains each point, -1 for none."""
         tree = self.tree
         place = ((points - self.low) * (2.0**tree.depth / float(self.size))).floor()
         inside = ((place >= 0) & (place < 1 << tree.depth)).all(-1)
@@ -123,7 +124,7 @@ class Leaves(SphericalHarmonicsField):
         return torch.where(inside & (value < 0), -1 - value, -1)
 
     def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point harmonic"]]:
-        """Density and harmonics of the leaf that each point is in; zeros where there is none."""
+        """Density and harmonics of the leaf that contains each point; zeros for none."""
         rows = self.rows_at(points)
         return self._rows(self.densities, rows)[:, 0].relu(), self._rows(self.harmonics, rows)
 
@@ -144,13 +145,13 @@ class Leaves(SphericalHarmonicsField):
 
     @torch.no_grad()
     def keep(self, rows: Bool[Tensor, " row"]) -> None:
-        """Leave some rows; where a leaf is gone, there is nothing."""
+        """Keep only some rows; the cells of the others become empty."""
         self.codes = self.codes[rows]
         self.densities, self.harmonics = nn.Parameter(self.densities[rows]), nn.Parameter(self.harmonics[rows])
 
     @property
     def centres(self) -> tuple[Float[Tensor, "row 3"], Float[Tensor, " row"]]:
-        """The middle of each leaf, and its side, in the scene's frame."""
+        """Centre and side of each leaf, in the scene's frame."""
         codes, levels = self.codes.long(), levels_of(self.codes.long())
         place = places_of(codes, levels)
         side = float(self.size) / 2.0**levels
@@ -158,7 +159,7 @@ class Leaves(SphericalHarmonicsField):
 
     @torch.no_grad()
     def octree(self) -> Octree:
-        """The noun: every cell of every divided one, with what it holds."""
+        """The scene as an `Octree`: every cell of every divided one, with its values."""
         tree = self.tree
         cells = tree.cells.view(-1, 2, 2, 2)
         own = torch.arange(len(cells), dtype=torch.int32, device=cells.device)[:, None, None, None]
@@ -188,8 +189,8 @@ class Leaves(SphericalHarmonicsField):
 
 
 def ask_for_octree(leaves: Leaves, depth: int | None = None) -> None:
-    """Raise LumigraphError where the noun would not fit into memory, all cells of all nodes written out and half as
-    much again while that is done, with the depth that would."""
+    """Raise LumigraphError if an `Octree` exceeds memory, all cells of all nodes written out and half as much again
+    during that, with the depth that fits."""
     codes, levels = leaves.codes.long(), levels_of(leaves.codes.long())
     device, deepest = codes.device, int(levels.max()) if len(codes) else 1
     free, nodes, fits = free_on(device), 0, 0
@@ -210,7 +211,7 @@ Subtree = tuple[Tree, Tensor, Tensor]  # a tree for some rows, and those rows of
 
 
 def places_of(codes: Int[Tensor, " row"], levels: Int[Tensor, " row"]) -> Int[Tensor, "row 3"]:
-    """Whole numbers of cells along each axis, among the cells of their level."""
+    """Whole-number coordinates of cells in their level."""
     place = torch.zeros(len(codes), 3, dtype=torch.int64, device=codes.device)
     for k in range(int(levels.max()) if len(levels) else 0):
         bits = torch.stack([codes >> 3 * k + 2, codes >> 3 * k + 1, codes >> 3 * k], -1) & 1
@@ -219,7 +220,7 @@ def places_of(codes: Int[Tensor, " row"], levels: Int[Tensor, " row"]) -> Int[Te
 
 
 def in_space(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
-    """The order in which cells of any levels lie along the curve through the cube (Morton 1966)."""
+    """Order of cells of any levels along the Morton curve (Morton 1966)."""
     levels = levels_of(codes)
     return (codes << 3 * (levels.max() - levels if len(levels) else levels)).argsort()
 

@@ -103,8 +103,7 @@ EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 class HarmonicField(Field):
     """Density and spherical harmonics at the nodes of a sparse grid over a space's coordinates (section 3.1).
 
-    touched: rows that the last evaluation with gradients touched, and a small table of these: gradients of others are
-             not made
+    touched: rows of the last evaluation with gradients, and a small table of them, to which gradients are confined
     """
 
     cheap_density: ClassVar[bool] = True
@@ -204,7 +203,7 @@ class Plenoxels(FieldMethod):
 
     @torch.no_grad()
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
-        """Leave the least important voxels out."""
+        """Prune the least important voxels."""
         weights = importance["network.voxels.harmonics"]
         kept = most_important(weights, 1 - share)
         self.voxels.keep(kept)
@@ -219,7 +218,7 @@ class Plenoxels(FieldMethod):
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Density and harmonics of the teacher at the finest grid's nodes, where it holds something."""
+        """Density and harmonics of the teacher at occupied nodes of the finest grid."""
         known, c, chance, space = teacher_of(teacher, cameras), self.config, self.random(3), self.network.space
         n = c.occupancy
         occupied = known.occupied(space, n.occupancy_resolution, n.occupancy_threshold, chance)
@@ -276,8 +275,8 @@ class Plenoxels(FieldMethod):
         return [self._table, *super().optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
-        """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates). It is in
-        proportion to the resolution, for it is density times a voxel's size that stops light."""
+        """Exponential decay; the density's rate has a warm-up (the release's delayed rates). It is proportional to the
+        resolution, because density times a voxel's size gives opacity."""
         c, share = self.config, self._resolution(progress) / 256
         up = math.sin(0.5 * math.pi * min(1.0, progress / c.density_delay)) if c.density_delay else 1.0
         density = c.density_learning_rate, c.final_density_learning_rate
@@ -323,6 +322,6 @@ def cells_of(space: Space, resolution: int) -> Cells:
 
 
 def undecided(opacity: Float[Tensor, " ray"]) -> Tensor:
-    """Mean of log(T) + log(1 - T), which is least where light passes wholly or not at all (eq. 5)."""
+    """Mean of log(T) + log(1 - T), smallest for transmittances of 0 or 1 (eq. 5)."""
     light = (1 - opacity).clamp(EDGE, 1 - EDGE)
     return (light.log() + (1 - light).log()).mean()

@@ -1,4 +1,4 @@
-"""Density and harmonics at the nodes of a sparse grid, which grows finer and loses what is empty."""
+"""Density and harmonics at the nodes of a sparse grid, with upsampling and pruning."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class SparseVoxels(nn.Module):
 
     @staticmethod
     def bytes_of(cells: Cells, learning: bool) -> int:
-        """Bytes of a grid at least: its index, and the values of as many nodes as are left of most scenes; where it
-        learns, as much again for their mean squares."""
+        """Lower bound of a grid's bytes: its index, and the values of as many nodes as most scenes keep; in training,
+        as much again for their mean squares."""
         nodes = (cells[0] + 1) * (cells[1] + 1) * (cells[2] + 1)
         return 4 * nodes + int(SHARE * nodes) * 4 * (1 + 3 * COEFFICIENTS) * (2 if learning else 1)
 
@@ -85,7 +85,7 @@ class SparseVoxels(nn.Module):
         return VoxelRows(self.nodes, self.density, self.harmonics).at(places, directions)
 
     def part(self, rows: Int[Tensor, " some"]) -> VoxelRows:
-        """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
+        """A small table of some rows, to which a step's sparse gradient is confined."""
         density, harmonics = (embedding(rows, table, sparse=True) for table in (self.density, self.harmonics))
         return VoxelRows(self.nodes.part(rows), density, harmonics)
 
@@ -103,7 +103,7 @@ class SparseVoxels(nn.Module):
 
     @torch.no_grad()
     def note(self, places: Float[Tensor, "sample 3"], weights: Float[Tensor, " sample"]) -> None:
-        """Remember samples' weights, each at the node that is nearest."""
+        """Record samples' weights, each at the nearest node."""
         shape = self.cells + 1
         x, y, z = ((places * 0.5 + 0.5).clamp(0, 1) * self.cells + 0.5).long().unbind(-1)
         row = self.nodes.index.view(-1)[(x * shape[1] + y) * shape[2] + z].long()
@@ -112,13 +112,13 @@ class SparseVoxels(nn.Module):
 
     @torch.no_grad()
     def important(self, weight: float) -> Bool[Tensor, "x y z"]:
-        """Cells with a node at which some sample weighed so much; the others next to each such node stay too, which
-        makes room for what was missed (the paper's dilation). All cells, where no sample weighed so much."""
+        """Cells at and next to nodes with at least a recorded weight (the paper's dilation). All cells, if there is
+        none."""
         return self._around(self.weights > weight)
 
     @torch.no_grad()
     def dense(self, density: float) -> Bool[Tensor, "x y z"]:
-        """Cells with a node of such a density, and those next to it, as above."""
+        """Cells at and next to nodes with at least a density."""
         return self._around(self.density[:, 0] > density)
 
     def _around(self, rows: Bool[Tensor, " row"]) -> Bool[Tensor, "x y z"]:
@@ -131,7 +131,7 @@ class SparseVoxels(nn.Module):
 
     @torch.no_grad()
     def keep(self, rows: Bool[Tensor, " row"]) -> None:
-        """Leave some rows; where a node has none any more, there is nothing."""
+        """Keep only some rows; the other nodes become empty."""
         self.numbers, self.weights = self.numbers[rows], self.weights[rows]
         self.density, self.harmonics = nn.Parameter(self.density[rows]), nn.Parameter(self.harmonics[rows])
 
@@ -139,8 +139,8 @@ class SparseVoxels(nn.Module):
     def rebuild(
         self, kept: Bool[Tensor, "x y z"], cells: Cells, optimizer: torch.optim.Optimizer | None = None
     ) -> None:
-        """Another grid in this one's place: so many cells, of which those stay that overlap a kept one, with the values
-        that this one has there. What an optimizer remembers of each row follows as well.
+        """Resample to a grid of so many cells, keeping those that overlap a kept one, with interpolated values and
+        optimizer moments.
 
         kept: cells of a grid of any size over the same coordinates
         """

@@ -105,9 +105,9 @@ STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what 
 
 @dataclass(frozen=True)
 class Glimpses(Batch):
-    """Rays that photographs tell of, and patches of rays that nobody photographed.
+    """Rays of photographs, and patches of rays at unobserved views.
 
-    unseen: rays of patches, one after another
+    unseen: rays of patches, concatenated
     """
 
     unseen: Rays | None = None
@@ -210,8 +210,8 @@ class RegNeRF(FieldMethod):
         return terms
 
     def _behind_patches(self, unseen: Rays, random: bool, generator: torch.Generator) -> Float[Tensor, "ray 3"]:
-        """Colours behind unobserved patches: the scene's own, or where photographs have alpha a random one for each
-        patch, as behind the patches that the flow learnt from. Before the scene's own, matter of its colour is free."""
+        """Background colours of unobserved patches: the scene's own, or for photographs with alpha a random one for
+        each patch, as in the flow's training patches. Before the scene's own, density of its colour has no cost."""
         if not random:
             return self.background.expand(len(unseen), 3)
         return backdrops(len(unseen) // SIDE**2, generator).repeat_interleave(SIDE**2, 0).to(self.device)
@@ -237,7 +237,7 @@ class RegNeRF(FieldMethod):
         return roughness(place.view(shape), seen.opacity.view(shape))
 
     def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
-        """Optical thickness of the first share of each ray, mean of all rays."""
+        """Optical thickness of the first share of each ray, mean over rays."""
         space = self.network.space
         share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
         until = space.distance(share, rays, *space.interval(rays))[:, 0]
@@ -266,8 +266,8 @@ class RegNeRF(FieldMethod):
 
 
 def field_of(frame: Frame, config: Config) -> str:
-    """The field of a Config in a frame. With auto that is the network for an object of few photographs, which a table
-    explains one by one, and the table elsewhere."""
+    """The field of a Config in a frame. With auto that is the network for an object of few photographs, to which a
+    table would overfit, and the table elsewhere."""
     if config.field != "auto":
         return config.field
     few = 0 < frame.train_count < MIN_TABLE_VIEWS
@@ -288,7 +288,7 @@ def clipped(optimizer: torch.optim.Optimizer, most: float) -> torch.optim.Optimi
 
 
 def joined(first: Rays, second: Rays) -> Rays:
-    """Rays, and others after them, of no photograph."""
+    """Rays concatenated with others of no photograph."""
     pairs = ((getattr(first, name), getattr(second, name)) for name in ("origins", "directions", "radius"))
     return Rays(*(torch.cat(pair) for pair in pairs))
 

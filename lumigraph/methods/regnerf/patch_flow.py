@@ -26,7 +26,8 @@ STIFF = 1.5  # bound of each coupling's log scale
 
 
 class Coupling(nn.Module):
-    """Half of the numbers, scaled and moved as the other half says (Dinh 2017, section 3.2)."""
+    """Affine coupling: half of the numbers, scaled and shifted by functions of the other half (Dinh 2017, section
+    3.2)."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -45,9 +46,9 @@ class Coupling(nn.Module):
 
 
 class PatchFlow(nn.Module):
-    """The density of patches: whitened, turned to a random basis, coupled a few times.
+    """Normalising flow of patches: whitening, rotation to a random basis, coupling layers.
 
-    mean, whiten: of the patches that it learnt from
+    mean, whiten: of the training patches
     stretched:    log determinant of whitening
     """
 

@@ -95,7 +95,7 @@ SOLID_OPACITY = 0.9  # opacity from which on a pixel of an open capture shows ba
 
 
 class RaySum(NamedTuple):
-    """Sums along each ray, with nothing behind it."""
+    """Composited sums along each ray, without a background."""
 
     diffuse: Float[Tensor, "ray 3"]
     opacity: Float[Tensor, " ray"]
@@ -104,7 +104,7 @@ class RaySum(NamedTuple):
 
 
 class VoxelParameters(nn.Module):
-    """Values of voxels while they learn, none before and after."""
+    """Trainable voxel values, empty before and after training."""
 
     grows = ("values",)
 
@@ -114,10 +114,11 @@ class VoxelParameters(nn.Module):
 
 
 class SNeRG(FieldMethod):
-    """A field learns from photographs; its values are baked into voxels; the small network learns on with those.
+    """A field is trained on photographs; its values are baked into voxels; the small network is trained further with
+    those.
 
     began:      share of the budget at which the field was baked; -1 before
-    of_another: whether the voxels were made of another method
+    of_another: whether the voxels were baked from another method
     longest_side: pixels of the largest photograph; 0 while unknown. Voxels need not be much finer than it
     """
 
@@ -163,7 +164,7 @@ class SNeRG(FieldMethod):
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """Voxels begin close to their values, and rays in minutes are few for each: steps of 0.01 add noise."""
+        """A lower learning rate: voxels start close to their values, and with few rays for each, 0.01 adds noise."""
         return replace(cls.preset(device), voxel_learning_rate=0.003)
 
     @classmethod
@@ -195,12 +196,12 @@ class SNeRG(FieldMethod):
 
     @property
     def _bounded(self) -> bool:
-        """True if voxels hold the box of interest of an open capture alone."""
+        """True if voxels cover only the box of interest of an open capture."""
         return self.sampler.is_open and self.voxels.space is None
 
     @property
     def _values(self) -> Float[Tensor, "voxel 8"]:
-        """Values of voxels: as they are learnt, or of eight bits."""
+        """Values of voxels: trainable ones, or of eight bits."""
         return self.tuned.values if self.stage == VOXELS else self.voxels.values
 
     def _marched(self, rays: Rays) -> RaySum:
@@ -375,7 +376,7 @@ class SNeRG(FieldMethod):
 
     @torch.no_grad()
     def _bake(self, geometry: Geometry) -> None:
-        """Hold a field's values at the voxels that rays see, instead of the field (section 5.1)."""
+        """Bake a field's values at visible voxels, replacing the field (section 5.1)."""
         c, visible = self.config, self.visibility.visible
         low, edge, size = self._grid(visible)
         wide = 2.0 if self.voxels.space else 1.0  # of the grid in coordinates of its space
@@ -407,7 +408,7 @@ class SNeRG(FieldMethod):
 
     @torch.no_grad()
     def _drop_hidden(self) -> None:
-        """Leave out voxels that no training ray met while they learnt, once more rays came by than there are others."""
+        """Prune voxels without a training ray, once there were more rays than voxels with one."""
         known = self._lazy.state.get(self.tuned.values) if self._lazy else None
         if not known:
             return
@@ -444,18 +445,17 @@ class SNeRG(FieldMethod):
         self.visibility.release()
 
     def _exchange(self, module: nn.Module, name: str, values: Tensor) -> None:
-        """A parameter of another size."""
+        """Replace a parameter by one of another size."""
         old = getattr(module, name)
         mine = [x for x in (self._lazy, self._adam) if x and any(old is p for g in x.param_groups for p in g["params"])]
         exchange(module, name, values.detach().clone(), mine[0] if mine else None)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Take over density where cameras see a teacher's surfaces, and as diffuse colour what is seen there along the
-        mean of their directions. What depends on direction, features and network find out in what is learnt from then
-        on.
+        """Bake a teacher's density at visible surfaces, and as diffuse colour its colour along their mean viewing
+        direction. View-dependent features and network are trained afterwards.
 
-        Raises LumigraphError where cameras see nothing solid.
+        Raises LumigraphError if cameras see no surface.
         """
         self.longest_side.fill_(cameras.size.max())
         known, grid = teacher_of(teacher, cameras), self.visibility
@@ -480,7 +480,7 @@ class SNeRG(FieldMethod):
 
 
 def slabs(x: int, y: int, z: int) -> Iterator[tuple[int, int]]:
-    """From where to where along x parts of a grid go that can be looked at together."""
+    """Ranges along x of parts of a grid that fit into a chunk."""
     thick = max(1, SLAB_VOXELS // (y * z))
     for first in range(0, x, thick):
         yield first, min(x, first + thick)

@@ -1,4 +1,4 @@
-"""Baked voxels: alpha, diffuse colour and features at those voxels of a grid that hold something and are seen."""
+"""Baked voxels: alpha, diffuse colour and features at the occupied, visible voxels of a grid."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class BakedVoxels(nn.Module):
     def hold(
         self, places: Int[Tensor, "voxel 3"], low: Float[Tensor, " 3"], edge: float, size: Int[Tensor, " 3"]
     ) -> None:
-        """Other voxels, of which nothing is known yet."""
+        """Replace the voxels, with empty values."""
         self.places, self.levels = places.short(), places.new_zeros(len(places), CHANNELS, dtype=torch.uint8)
         self.low, self.edge, self.size = low.float(), torch.tensor(edge, device=low.device), size.long()
 
@@ -79,7 +79,7 @@ class BakedVoxels(nn.Module):
 
     @property
     def _known(self) -> tuple[kernels.Blocks, Tensor]:
-        """Blocks and values, made when they are asked for."""
+        """Blocks and values, built on first use."""
         of = self.places, self.places._version, self.levels, self.levels._version
         if self._made is None or any(a is not b for a, b in zip(self._made[0], of, strict=True)):
             x, y, z = self.size.tolist()
@@ -110,7 +110,7 @@ class BakedVoxels(nn.Module):
     def samples(
         self, rays: Rays, values: Float[Tensor, "voxel 8"], near: float
     ) -> tuple[Samples, Float[Tensor, "sample 8"]]:
-        """The steps of rays that meet something, each a voxel long, with what they meet."""
+        """Non-empty steps of rays, each a voxel long, with their values."""
         starts, ends, counts, found = [], [], [], []
         for first in range(0, len(rays), FEW):
             origins, directions, enter, leave = self._along(rays[first : first + FEW], near)
@@ -136,17 +136,17 @@ class BakedVoxels(nn.Module):
         return samples, torch.cat(found) if found else values[:0]
 
     def length(self, points: Float[Tensor, "point 3"], edge: Tensor | float) -> Float[Tensor, " point"]:
-        """Length along the way out of a voxel with such an edge, in scene units."""
+        """Length of a voxel of this edge along the radial direction, in scene units."""
         radius = points.norm(dim=-1) if self.space else points.new_zeros(len(points))
         return edge * radius.clamp_min(1).square()
 
     @staticmethod
     def density(alpha: Float[Tensor, " point"], length: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
-        """Per scene unit, of what has an alpha over a length: alpha = 1 - exp(-density length)."""
+        """Density per scene unit of an alpha over a length: alpha = 1 - exp(-density length)."""
         return -torch.log1p(-alpha.clamp(0, OPAQUE)) / length
 
     def atlas(self, levels: UInt8[Tensor, "voxel 8"], view: ViewDependence | None) -> Atlas:
-        """All of it for browsers and files."""
+        """The voxels as an atlas for browsers and files."""
         rows = self.blocks.rows.long()
         table = torch.cat([levels, levels.new_zeros(1, CHANNELS)])
         values = table[torch.where(rows >= 0, rows, len(levels))]
@@ -211,7 +211,7 @@ class VisibilityGrid(Part):
 
     @property
     def visible(self) -> Bool[Tensor, "x y z"]:
-        """Cells that rays see, and those around them."""
+        """Visible cells, dilated by one."""
         return max_pool3d((self.weight > MIN_WEIGHT).float(), 3, 1, 1)[0] > 0
 
     def inside(self, points: Float[Tensor, "sample 3"]) -> Bool[Tensor, " sample"]:

@@ -80,7 +80,7 @@ class HashDeferred(DeferredField):
 
 
 class Released(Dense):
-    """A layer whose weights may be dropped, and then have no rows."""
+    """A layer with releasable weights, which then have no rows."""
 
     grows = ("weight", "bias")
 
@@ -122,7 +122,7 @@ class ViewDependence(nn.Module):
 
     @torch.no_grad()
     def take(self, network: ViewNetwork | None) -> None:
-        """Load a network of the same width, or one that adds nothing."""
+        """Load a network of the same width, or one without contribution."""
         if network is None:
             nn.init.zeros_(self.last.weight)
             nn.init.constant_(self.last.bias, NOTHING)

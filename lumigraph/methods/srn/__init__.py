@@ -80,8 +80,8 @@ MIN_OPACITY = 0.05  # from which on a ray has a depth
 
 
 class SRN(RayMethod):
-    """Learns from a Collection a code for each member, a hypernetwork that makes the scene's network of a code, and how
-    to march through any of these; `given` a Scene, it finds the code that looks like its photographs."""
+    """Learns from a Collection a code for each member, a hypernetwork from codes to scene networks, and a ray marcher
+    for these; `given` a Scene, it fits the code to its photographs."""
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
     learning_rate = exponential_decay
@@ -217,7 +217,7 @@ class SRN(RayMethod):
 
     @property
     def code(self) -> Float[Tensor, " code"]:
-        """Code of the scene that is shown."""
+        """Code of the current scene."""
         return self.codes.code_of(str(self.control("instance")), **self._others)
 
     @property
@@ -237,7 +237,7 @@ class SRN(RayMethod):
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same weights with the code of a scene of which photographs are given; or another learnt one."""
+        """The same weights with the code of a scene's photographs; or another trained one."""
         scenes = [piece for piece in evidence if isinstance(piece, Scene)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
         assert isinstance(told, SRN)
@@ -248,7 +248,7 @@ class SRN(RayMethod):
         return told
 
     def drawn(self, seed: int) -> Method:
-        """A scene that nobody has photographed: a code from the Gaussian that fits the learnt ones."""
+        """A random scene: a code from the Gaussian fitted to the trained codes."""
         told = super().given()
         assert isinstance(told, SRN)
         told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
@@ -259,9 +259,9 @@ class SRN(RayMethod):
         self.settings.pop("instance", None)
 
     def _code_of(self, scene: Scene) -> Float[Tensor, " code"]:
-        """The code that explains photographs best, with the networks as they are (section 4, few-shot reconstruction).
+        """The code with the smallest error on photographs, with frozen networks (section 4, few-shot reconstruction).
 
-        The fit begins at the learnt code that looks most like them.
+        The fit starts at the trained code with the smallest error.
         """
         c, generator = self.config, self.random(2)
         photographs = [scene.photograph(i) for i in scene.splits["train"].tolist()]

@@ -50,7 +50,7 @@ class SceneHyperNetwork(nn.Module):
 
 
 def scene_features(layers: list[Layer], points: Float[Tensor, "member ray 3"]) -> Features:
-    """Phi(x): what is at points of each member's scene (eq. 1), by layers with normalisation and ReLU."""
+    """Phi(x): features of points of each member's scene (eq. 1), by layers with normalisation and ReLU."""
     x = points
     for weights, biases in layers:
         x = layer_norm(torch.baddbmm(biases, x, weights.transpose(1, 2)), [weights.shape[1]]).relu()
@@ -58,7 +58,7 @@ def scene_features(layers: list[Layer], points: Float[Tensor, "member ray 3"]) -
 
 
 class RayMarcher(nn.Module):
-    """An LSTM that finds each ray's surface (algorithm 1): its state after a look at Phi gives the next step's length.
+    """An LSTM that finds each ray's surface (algorithm 1): from the features Phi it predicts the next step's length.
 
     (h, c)_i+1 = LSTM(Phi(x_i), (h, c)_i),    d_i+1 = d_i + w . h_i+1 + b,    x_i+1 = o + d_i+1 r
     """

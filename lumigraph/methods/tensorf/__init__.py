@@ -84,7 +84,7 @@ class Config:
             )
 
     def finest(self, unbounded: bool) -> int:
-        """Nodes per axis in the end, as a cube's."""
+        """Final number of nodes per axis, as a cube's."""
         return self.open_final_resolution if unbounded else self.final_resolution
 
 
@@ -128,7 +128,7 @@ class TensorField(Field):
 
     @property
     def others(self) -> list[nn.Parameter]:
-        """Parameters beside planes and lines: the basis matrix and the network."""
+        """Parameters other than planes and lines: the basis matrix and the network."""
         return [x for module in (self.basis, getattr(self, "network", None)) if module for x in module.parameters()]
 
     def places(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
@@ -151,7 +151,7 @@ class TensorField(Field):
     def shade(
         self, features: Float[Tensor, "sample feature"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
-        """S: features become a colour seen along directions."""
+        """S: colour of features along directions."""
         c = self.config
         if c.shading == "sh":
             harmonics = spherical_harmonics(directions, SH_BANDS)
@@ -261,7 +261,7 @@ class TensoRF(FieldMethod):
         return [self._optimizer, others, *super().optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float:
-        """Constant until the grid is as fine as it gets, then exponential decay."""
+        """Constant until the final resolution, then exponential decay."""
         c, last = self.config, UPSAMPLINGS[-1]
         return falling(c.learning_rate, c.final_learning_rate, max(0.0, progress - last) / (1 - last))
 
@@ -276,7 +276,7 @@ class TensoRF(FieldMethod):
         super().before_step(step, progress)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """The finest grid, in a box around what the teacher holds, taught by it at points."""
+        """The finest grid, in a box around the teacher's occupied region, distilled from it at points."""
         known, c, chance, network = teacher_of(teacher, cameras), self.config, self.random(3), self.network
         self.sampler.begin_from(known, chance)
         self._shrink()
@@ -314,12 +314,12 @@ class TensoRF(FieldMethod):
         return importance
 
     def _resolution(self, stage: int) -> int:
-        """Evenly in the logarithm from the first resolution to the last (section 5)."""
+        """Resolution of a stage, linear in its logarithm from the first to the last (section 5)."""
         first, last = self.config.initial_resolution, self.config.finest(self.sampler.is_open)
         return round(first * (last / first) ** (stage / len(UPSAMPLINGS)))
 
     def _shrink(self) -> None:
-        """Make an object's box as small as the cells that hold something; if none does, leave it."""
+        """Shrink an object's box to the occupied cells, if there are any."""
         if isinstance(self.sampler, OccupancySampler):
             box = self.network.box
             found = self.sampler.grid.box.to(box)
@@ -328,8 +328,8 @@ class TensoRF(FieldMethod):
                 self.network.box = torch.stack([low, high])
 
     def _resample(self, resolution: int, old: Float[Tensor, "2 3"], fresh: torch.Generator | None = None) -> None:
-        """Give the grids a resolution in the present box; its nodes are between those that they have in the old box, or
-        random ones. The optimizer begins anew with them, as the code does."""
+        """Resample the grids to a resolution in the present box, by interpolation from the old box, or at random. The
+        optimizer restarts, as in the code."""
         box = self.network.box
         nodes = nodes_in(box, resolution)
         low, high = (box - old[0]) / (old[1] - old[0])

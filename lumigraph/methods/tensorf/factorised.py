@@ -1,4 +1,4 @@
-"""A grid held as factors: planes and lines that learn, and that are resampled as learning goes from coarse to fine."""
+"""A factorised grid: trainable planes and lines, resampled from coarse to fine."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class FactorGrid(nn.Module):
 
     @torch.no_grad()
     def resampled(self, nodes: Nodes, part: Ends) -> Float[Tensor, "row component"]:
-        """A table with other nodes over a part of the cube, from corner to corner, by linear interpolation
-        (section 4.4: upsampling, and shrinking to what holds something)."""
+        """A table resampled to other nodes over a part of the cube, corner-aligned, by linear interpolation (section
+        4.4: upsampling, and shrinking to the occupied region)."""
         places = [torch.linspace(float(a), float(b), n) for a, b, n in zip(*part, nodes, strict=True)]
         factors = self.factors
         axes = [mode[:2] for mode in MODES] if self.kind == "vm" else []
@@ -98,11 +98,11 @@ def _between(values: Tensor, dimension: int, places: Float[Tensor, " new"]) -> T
 
 @torch.no_grad()
 def truncate(grid: FactorGrid, share: float, weights: Float[Tensor, "product component"] | None = None) -> None:
-    """Set the components to zero that matter least, which together have a share of all squared magnitude.
+    """Zero the least important components, with a given share of the squared magnitude in total.
 
-    weights: how much each product counts in what is made of them. None where all are summed up: then planes and lines
-             are first turned into those of the singular value decomposition of their products, which no other
-             components of that number come nearer to (Eckart and Young 1936)
+    weights: of each product in the output. None for a plain sum: then planes and lines are first replaced by the
+             singular value decomposition of their products, the best approximation with that number of components
+             (Eckart and Young 1936)
     """
     parts = [part.view(-1, part.shape[-1]) for part in grid.factors.split(grid.table)]
     products = grid.factors.products
