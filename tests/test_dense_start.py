@@ -14,7 +14,8 @@ from torch.nn.functional import normalize
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Fisheye, OpenCV, Pinhole
-from lumigraph.components.clouds import dense_points, initialization
+from lumigraph.components.clouds import initialization
+from lumigraph.components.training import dense_points
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.depth_maps.flat_view import flat_view

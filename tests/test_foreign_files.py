@@ -141,7 +141,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 WRITE_NOTHING = {"info", "methods"}
 # See the tests of checkpoints, of what is saved in the viewer, and of the app, which makes folders of its own.
-WITHIN_RUNS = {"app", "resume", "view"}
+WITHIN_RUNS = {"app", "georeference", "resume", "view"}
 
 
 @pytest.fixture(scope="module")

@@ -75,7 +75,9 @@ def test_an_option_that_became_a_constant_opens(run):
     older = replace(settings, config=asdict(kind.smallest()) | {"fit_weight": 1e-4})
     assert older.method_config(kind, run.folder) == kind.smallest()
     kind = methods.find("articulated-splatting")  # a whole part became one
-    older = replace(settings, config=asdict(kind.smallest()) | {"tidying": asdict(articulated_splatting.TIDYING)})
+    older = replace(
+        settings, config=asdict(kind.smallest()) | {"tidying": {"prune_near": articulated_splatting.PRUNE_NEAR}}
+    )
     assert older.method_config(kind, run.folder) == kind.smallest()
 
 

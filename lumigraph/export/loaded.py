@@ -163,7 +163,7 @@ def export_splats(
     else:
         loaded = Loaded.of(opened, "cpu", settings, part, scaling)
         cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix, far=True)
-    write_gaussians(path, cloud, Detail(**options.detail.given), options.spz_version)
+    write_gaussians(path, cloud, Detail(**options.detail.given), int(options.spz_version))
     return cloud
 
 

@@ -301,7 +301,7 @@ class SplatsOptions:
     detail: OmitArgPrefixes[Levels] = Levels()
     duration: Annotated[Seconds, option("SECONDS")] = 3.0
     """With .4dgs: time that the whole capture takes when it is played; longer is slower."""
-    spz_version: Literal[3, 4] = 4
+    spz_version: Literal["3", "4"] = "4"
     """With .spz: version of the format; more programs read 3."""
 
 

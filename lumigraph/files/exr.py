@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .reading import reads
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of BT.709, for files of luminance and chroma
 GREY = (
     "Y",
@@ -15,6 +17,7 @@ GREY = (
 )  # channels that a picture of one number a pixel may have, in the order in which they are looked for
 
 
+@reads()
 def read_exr(path: Path) -> np.ndarray:
     """Numbers of a picture, (height, width, 3 or 4), or (height, width) of one channel, over the display window, and 0
     where the file has none. Raises ValueError for deep files and for channels that are no picture."""

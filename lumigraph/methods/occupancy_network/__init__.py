@@ -141,7 +141,7 @@ class OccupancyNetwork(CodedSurface):
     def smallest(cls) -> Any:
         return changed(Config(), pool_points=4096, near_share=0.5, cloud_points=32, code=4, encoder_width=8,
             hidden_width=8, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
-            learning_rate=2e-2)  # fmt: skip
+            learning_rate=6e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
