@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import struct
 import unicodedata
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from lumigraph.gaussians import Gaussians
 from lumigraph.large import open_any
 from lumigraph.readers import choose_reader, colmap, phones, transforms
 from lumigraph.readers.finding import find_named, paired
+from lumigraph.readers.meshes import read_mesh
 from lumigraph.system.cache import cache_folder, temporary_cache
 
 pytestmark = budget("capture", 12)
@@ -332,3 +334,20 @@ def test_a_cloud_of_points_is_described(tmp_path):
     (tmp_path / "a.xyz").write_text("0 0 0")
     with pytest.raises(LumigraphError, match="convert it to"):
         choose_reader(tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
+def test_packed_meshes_are_refused_by_the_name_of_their_packing(tmp_path, name):
+    about = {
+        "asset": {"version": "2.0"},
+        "extensionsRequired": [name],
+        "meshes": [{"primitives": [{"attributes": {}}]}],
+    }
+    text = json.dumps(about).encode()
+    text += b" " * (-len(text) % 4)
+    (tmp_path / "a.gltf").write_bytes(text)
+    data = b"JSON".join([struct.pack("<4sIII", b"glTF", 2, 20 + len(text), len(text)), text])
+    (tmp_path / "a.glb").write_bytes(data)
+    for file in ("a.glb", "a.gltf"):
+        with pytest.raises(LumigraphError, match=f"packed by {name}, which is not read"):
+            read_mesh(tmp_path / file)

@@ -22,6 +22,8 @@ from ..files.ranges import Coordinate, Tally, between, format_value, typed
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
+PACKINGS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")  # of vertices
+MAX_JSON_BYTES = 1 << 24
 VERTICES, INDICES = 34962, 34963  # section 5.11.5: what a part of the buffer is for
 KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # 3.6.2.2
 NUMBERS = {np.dtype(kind): number for number, kind in KINDS.items()}
@@ -214,6 +216,20 @@ def _accessor(view: int, column: Column) -> dict[str, Any]:
     if column.bounded:
         fields |= {"min": numbers.min(0).tolist(), "max": numbers.max(0).tolist()}
     return fields
+
+
+def refuse_compressed(path: Path) -> None:
+    """Raise LumigraphError for glTF whose meshes are packed by an extension."""
+    with open(path, "rb") as file:
+        head = file.read(HEADER.size + CHUNK.size)
+        length = MAX_JSON_BYTES
+        if head[:4] == MAGIC and len(head) == HEADER.size + CHUNK.size:
+            length, head = CHUNK.unpack_from(head, HEADER.size)[0], b""
+        text = head + file.read(min(length, MAX_JSON_BYTES))
+    if found := [name for name in PACKINGS if f'"{name}"'.encode() in text]:
+        raise LumigraphError(
+            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression"
+        )
 
 
 class File:

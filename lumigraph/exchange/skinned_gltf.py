@@ -125,6 +125,7 @@ class _Nodes:
 @reads("is damaged", "export it again")
 def read_character(path: Path) -> SkinnedCharacter:
     """The first skinned mesh of a file with its bones and animations. Raises LumigraphError for a file without one."""
+    gltf.refuse_compressed(path)
     file = gltf.File(path)
     about = file.about
     index = next((i for i, node in enumerate(about.nodes) if node.mesh is not None and node.skin is not None), None)

@@ -15,6 +15,7 @@ from ..datasets.dataset import splits_of
 from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
+from ..exchange.gltf import refuse_compressed
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
 from ..files.reading import reads
@@ -75,6 +76,8 @@ def read_mesh(path: Path) -> Mesh:
 
     if path.stat().st_size > free_memory():
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
+    if path.suffix.lower() in (".glb", ".gltf"):
+        refuse_compressed(path)
     own = path.suffix.lower() == ".ply" and not has_texture(path)
     loaded: Any = read_ply(path) if own else trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
