@@ -51,10 +51,10 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
     Raises LumigraphError, which begins with `subject` and ends with `way_out`, for numbers that are not finite.
     """
     check_harmonics(gaussians, subject)
-    faults = unsound(gaussians)
+    faults = find_faults(gaussians)
     nowhere = faults.pop(NO_ROTATION)[:, None]
     if bad := int(torch.stack(list(faults.values())).any(0).sum()):
-        raise LumigraphError(f"{subject} holds {bad} of {len(gaussians)} Gaussians with {listed(faults)}; {way_out}")
+        raise LumigraphError(f"{subject} holds {bad} of {len(gaussians)} Gaussians with {describe(faults)}; {way_out}")
     quaternions = torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions)
     return replace(finite_logits(gaussians), quaternions=quaternions)
 
@@ -69,10 +69,10 @@ def without_unsound(gaussians: Gaussians, path: Path) -> tuple[Gaussians, Bool[T
     Raises LumigraphError where none is left.
     """
     check_harmonics(gaussians, str(path))
-    faults = unsound(gaussians)
+    faults = find_faults(gaussians)
     good = ~torch.stack(list(faults.values())).any(0)
     if not good.all():
-        text = f"{path} holds {int((~good).sum())} of {len(gaussians)} Gaussians with {listed(faults)}"
+        text = f"{path} holds {int((~good).sum())} of {len(gaussians)} Gaussians with {describe(faults)}"
         if not good.any():
             raise LumigraphError(f"{text}, and no other; write it again")
         warnings.warn(f"{text}; they are left out", LumigraphWarning, stacklevel=2)
@@ -85,7 +85,7 @@ def check_harmonics(gaussians: Gaussians, subject: str) -> None:
         raise LumigraphError(f"{subject} has {count} harmonics per Gaussian; bring them to 1, 4, 9 or 16")
 
 
-def unsound(gaussians: Gaussians) -> dict[str, Bool[Tensor, " gaussian"]]:
+def find_faults(gaussians: Gaussians) -> dict[str, Bool[Tensor, " gaussian"]]:
     """Masks of the Gaussians that are none, by the fault."""
     faults = {what: ~getattr(gaussians, name).isfinite().flatten(1).all(-1) for name, what in DISPLAY_NAMES.items()}
     return faults | {
@@ -94,7 +94,7 @@ def unsound(gaussians: Gaussians) -> dict[str, Bool[Tensor, " gaussian"]]:
     }
 
 
-def listed(faults: dict[str, Bool[Tensor, " gaussian"]]) -> str:
+def describe(faults: dict[str, Bool[Tensor, " gaussian"]]) -> str:
     """Faults and numbers of Gaussians as text: "no rotation (a half-written file?): 3"."""
     counts = {what: int(bad.sum()) for what, bad in faults.items() if bad.any()}
     none = counts.pop(NO_ROTATION, 0)

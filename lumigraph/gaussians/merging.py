@@ -58,7 +58,7 @@ class _Ellipsoids:
         return _Ellipsoids(cloud.means.double(), axes @ axes.mT, opacities, cloud.harmonics.double())
 
     def gaussians(self, like: Gaussians) -> Gaussians:
-        """As a cloud in single precision, with the remaining fields of `like`."""
+        """Cloud in single precision, with the remaining fields of `like`."""
         squares, axes = torch.linalg.eigh(self.covariances)
         axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # turned, not mirrored
         scales = squares.clamp_min(EPSILON).sqrt().log()

@@ -178,7 +178,7 @@ def about_dialect(path: Path, plain: Json) -> list[str]:
     if unknown := sorted(said - known):
         found.append(f"{path}: passed over: {', '.join(unknown)}")
     shared = {name: value for name, value in plain.items() if name != "frames"}
-    frames = [typed(Posed, shared | frame, path) for frame in plain["frames"]]
+    frames = [typed(Posed, shared | frame, path) for frame in plain["frames"] if said & {"k4", "rolling_shutter"}]
     if any(means_power(frame) for frame in frames):
         found.append(
             f"{path}: k4 without k5 and k6 is read as nerfstudio's, the coefficient of r^8; give all three for OpenCV's"
