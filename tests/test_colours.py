@@ -349,7 +349,7 @@ def test_films_that_are_written_are_tagged_bt709(tmp_path):
     with open_video(tmp_path / "a.mp4") as film:
         film.add(to_bytes(RGB))
     tags = tags_of(tmp_path / "a.mp4")
-    assert (tags.primaries, tags.transfer, tags.matrix, tags.whole) == (1, 1, 1, False)
+    assert (tags.primaries, tags.transfer, tags.matrix, tags.full_range) == (1, 1, 1, False)
 
 
 def test_pictures_without_a_tag_hold_numbers_or_lie_in_a_page():
