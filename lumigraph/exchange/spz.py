@@ -5,7 +5,7 @@ the current one, is written; pages hold 3, which unpacks where there is no zstd 
 three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
 back turned by 13 degrees.
 
-Axes are x right, y up, z back: see `codes.TURN_MEAN`. Adobe's extension names others (`in_system`). The other extensions,
+Axes are x right, y up, z back: see `codes.TURN_MEAN`. Adobe's extension names others (`in_system`). Further extensions,
 and harmonics of degree 4, are passed over with a warning.
 
 What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
