@@ -60,8 +60,8 @@ from .rendering import scattered as scattered
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
 from .rendering import unoccluded as unoccluded
-from .stage import SyntheticStage as SyntheticStage
 from .stage import Nuisances, nuisances_of, told
+from .stage import SyntheticStage as SyntheticStage
 from .world import Fog as Fog
 from .world import Lamp as Lamp
 from .world import Material as Material

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from scipy.ndimage import shift
 
-from ..camera import Camera
 from ..color.srgb import linear_from_srgb, srgb_from_linear
 from ..errors import LumigraphError
 from ..geometry import Similarity, evenly
@@ -45,7 +44,9 @@ def staged(stage: SyntheticStage, asked: Nuisances) -> SyntheticStage:
     """The stage with the nuisances that stand before the camera. Raises LumigraphError for a world without objects."""
     changed = asked.shape or asked.open or asked.clutter or asked.backdrop or asked.turntable
     if changed and not stage.world.objects:
-        raise LumigraphError("shape, open, clutter, backdrop and turntable need a scene of solids; a skinned mesh is none")
+        raise LumigraphError(
+            "shape, open, clutter, backdrop and turntable need a scene of solids; a skinned mesh is none"
+        )
     if asked.shape:
         if stage.moving is not None or stage.differing is not None:
             raise LumigraphError("shape replaces the object of a still scene, and this one changes; leave shape out")
@@ -106,7 +107,9 @@ def statue(seed: int, stage: SyntheticStage) -> Iterator[Object]:
         return Object(shape, paint, place, "statue")
 
     base = 0.3 * size
-    yield part(Arch((0.6 * size, 0.6 * size, base), 0.35 * size, 0.1 * size), 0, 0, floor + base, random.uniform(0, 360))
+    yield part(
+        Arch((0.6 * size, 0.6 * size, base), 0.35 * size, 0.1 * size), 0, 0, floor + base, random.uniform(0, 360)
+    )
     for _ in range(STATUE_PARTS - 4):
         radius = random.uniform(0.15, 0.35) * size
         body = Ball(radius) if random.integers(2) else Cuboid((radius, 0.8 * radius, radius), 0.2 * radius)
@@ -121,7 +124,7 @@ def statue(seed: int, stage: SyntheticStage) -> Iterator[Object]:
 
 def background(stage: SyntheticStage, distance: float) -> Iterator[Object]:
     """Ground, and a ring of things at a distance behind the cameras."""
-    random, (x, y, z) = np.random.default_rng(0x0BE4), middle_of(stage)
+    random, (x, y) = np.random.default_rng(0x0BE4), middle_of(stage)[:2]
     floor, distance = stage.bounds[0][2], distance + distance_of(stage)
     yield Object(Plane(), Material(Mottle((0.52, 0.50, 0.42), (0.30, 0.38, 0.24), 0.5)), Pose.at(x, y, floor), "ground")
     for k in range(RING):
@@ -148,13 +151,14 @@ def carried(stage: SyntheticStage, turns: bool) -> SyntheticStage:
     """The stage before a background that goes with the camera. turns: exactly, as where an object turns before a still
     camera; else a board that is carried round, and sways."""
     random, middle = np.random.default_rng(0xB0A2), middle_of(stage)
-    sizes = [len(cameras) for cameras in stage.cameras.values()]
-    first = np.cumsum([0, *sizes])
-    numbered = {
-        split: cameras if cameras.image_index is not None else replace(cameras, image_index=torch.arange(a, a + len(cameras)))
-        for (split, cameras), a in zip(stage.cameras.items(), first, strict=False)
-    }  # fmt: skip
-    every = {int(old.image_index[i]): stage.cameras[split][i] for split, old in numbered.items() for i in range(len(old))}
+    numbered, first = {}, 0
+    for split, cameras in stage.cameras.items():
+        if cameras.image_index is None:
+            cameras = replace(cameras, image_index=torch.arange(first, first + len(cameras)))
+        numbered[split], first = cameras, first + len(cameras)
+    every = {
+        int(old.image_index[i]): stage.cameras[split][i] for split, old in numbered.items() for i in range(len(old))
+    }
     offsets = dict(zip(every, random.normal(0, 0 if turns else SWAY, (len(every), 3)), strict=True))
     paints = [Material(textures(np.random.default_rng((k, 0xB0)), 0.2)) for k in range(5)]
 
@@ -169,10 +173,11 @@ def carried(stage: SyntheticStage, turns: bool) -> SyntheticStage:
             side = 0.12 * away
             things += [(Cuboid((side, side, side)), away * np.array([a, b, 1 + 0.8 * BOARD_WAY])) for a, b in places]
         world, tilt = stage.world_of(camera), rotation_about((0, 1, 0), 20 * offsets[index][0])
+        places = [eye + axes @ (place + away * offsets[index]) for _, place in things]
         added = tuple(
-            Object(shape, paint, Pose(tuple((eye + axes @ (place + away * offsets[index])).tolist()), nested(axes @ tilt)), "backdrop")
-            for (shape, place), paint in zip(things, paints, strict=False)
-        )  # fmt: skip
+            Object(shape, paint, Pose(tuple(place.tolist()), nested(axes @ tilt)), "backdrop")
+            for (shape, _), place, paint in zip(things, places, paints, strict=False)
+        )
         return replace(world, objects=(*world.objects, *added), sky=replace(world.sky, visible=True))
 
     reach = max(stage.reach, (2 * BOARD_SIZE + 1) * distance_of(stage))
@@ -200,7 +205,9 @@ def disturbed_shot(shot: Shot, asked: Nuisances, number: int) -> Shot:
     random, planes = np.random.default_rng((number, 0xD157)), dict(shot.planes)
     if shot.split == "train":
         if asked.exposure or asked.white_balance or asked.blur:
-            gains = 2 ** (asked.exposure * random.uniform(-1, 1)) * (1 + asked.white_balance / 100 * random.uniform(-1, 1, 3))
+            gains = 2 ** (asked.exposure * random.uniform(-1, 1)) * (
+                1 + asked.white_balance / 100 * random.uniform(-1, 1, 3)
+            )
             way = asked.blur * random.uniform(0.5, 1) * sphere_point(random.uniform(0, math.pi), 0.0)[:2]
             assert callable(shot.image)
             identity = shot.identity and f"{shot.identity} {gains.tolist()} {way.tolist()}"
@@ -283,7 +290,8 @@ def worse_depth(asked: Nuisances, unknown: float, seed: int, stored: np.ndarray)
 
 
 def moved(capture: Capture, scale: float, offset: float) -> Capture:
-    """The capture in another unit, its origin far away. Raises LumigraphError for a block world, whose unit is an edge."""
+    """The capture in another unit, its origin far away. Raises LumigraphError for a block world, whose unit is an edge
+    of its blocks."""
     if capture.blocks is not None:
         raise LumigraphError(f"{capture.source}: a block world has one unit; leave scale and offset out")
     motion = Similarity.make(scale, translation=torch.full((3,), offset, dtype=torch.float64))

@@ -104,7 +104,8 @@ class Nuisances:
     open: distance of a background behind the cameras, scene units; clutter: number of small things near cameras
     turntable: the background goes with the camera, as where the object turns; backdrop: a board that is carried round
     step: one of so many training photographs in turn is kept; few: so many, evenly spread; order: shuffled names
-    poses: error of training poses, pixels; blur: of moved cameras, pixels; exposure: stops up or down; white_balance: percent
+    poses: error of training poses, pixels; blur: of moved cameras, pixels
+    exposure: stops up or down; white_balance: percent
     holes: unknown pixels of measured depth; noise: errors of it
     labels: percent of wrong pixels, and of photographs without labels
     scale: unit of the source; offset: of its origin along each axis

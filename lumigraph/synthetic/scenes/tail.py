@@ -81,6 +81,12 @@ class Tail:
 
 
 def stage(
-    size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, jitter_bones: int = 0, joints: int = 12, clips: int = 3
+    size: int = 200,
+    views: int = 100,
+    seed: int = 0,
+    rig: int = 0,
+    jitter_bones: int = 0,
+    joints: int = 12,
+    clips: int = 3,
 ) -> SyntheticStage:
     return photographed(Tail(joints, clips), size, views, seed, rig, jitter_bones)
