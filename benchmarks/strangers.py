@@ -7,9 +7,9 @@
     python benchmarks/strangers.py OUTPUT --publish                        the figures for docs/benchmarks.md
 
 A cell trains by `lumigraph train` or `track` and compares by `lumigraph eval`, in a process of its own and for a number
-of steps, so that other programs change its time alone. OUTPUT/results.json has for each cell:
+of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for each cell:
 
-    outcome     ok; refused, with the sentence; crash; too slow, where the wall limit ended it
+    outcome     ok; refused, with the sentence; crash; too slow, where a limit of seconds ended it
     score       the first of its evaluation, and beside it the baseline: the better one of mean and nearest training
                 photograph; the convex hull of a shape; a camera that stands still; an untrained method for words and
                 worlds
@@ -26,6 +26,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import shlex
 import signal
 import subprocess
@@ -59,7 +60,7 @@ from lumigraph.readers.capture import Capture
 from lumigraph.run import Run
 
 RESULTS = Path(__file__).parent / "results" / "strangers-cpu.json"
-WALL_SECONDS = 300  # of a cell at the most
+CELL_SECONDS, WALL_SECONDS = 240, 1200  # of a cell at the most: of the processor, and by the clock
 EVAL_VIEWS, COVERED, SIDE = 4, 0.05, 160  # compared views; relative error of depth; pixels of photographs in --data
 SOLID = 0.5  # opacity of a surface
 HULL_POINTS = 50_000
@@ -284,7 +285,7 @@ def main(options: Options) -> None:
         {name: Result(**row) for name, row in json.loads(path.read_text())["cells"].items()} if path.exists() else {}
     )
     cells = [cell for cell in chosen(options, output) if cell.name not in results]
-    if apart(partial(make_data, output / "data", cells), output / "data.log"):
+    if apart(partial(make_data, output / "data", cells), output / "data.log")[0]:
         raise SystemExit(f"The data could not be made; {output / 'data.log'} has the reason")
     for number, cell in enumerate(cells, 1):
         results[cell.name] = result = carry_out(cell, output)
@@ -348,9 +349,7 @@ def carry_out(cell: Cell, output: Path) -> Result:
     log.parent.mkdir(parents=True, exist_ok=True)
     subprocess.run(["rm", "-rf", str(folder)], check=True)
     found = Result(cell.method, cell.setting, command.replace(str(output), "OUTPUT"), expected=cell.steps)
-    begin = time.monotonic()
-    code = apart(partial(inside, cell, folder), log)
-    found.seconds = round(time.monotonic() - begin, 1)
+    code, found.seconds = apart(partial(inside, cell, folder), log)
     text = log.read_text("utf-8", errors="replace")
     lines = [line for line in re.split(r"[\r\n]+", text) if line.strip()]
     found.warnings = sorted({line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")})
@@ -361,18 +360,19 @@ def carry_out(cell: Cell, output: Path) -> Result:
         found.outcome, found.sentence = "crash", lines[-1]
     elif code == 2:
         found.outcome, found.sentence = "refused", lines[-1].removeprefix("lumigraph: ")
-    elif code != -signal.SIGKILL:
+    elif code not in (-signal.SIGKILL, -signal.SIGXCPU):
         found.outcome, found.sentence = "crash", f"exit code {code}"
     return found
 
 
-def apart(work: Callable[[], object], log: Path, seconds: float = WALL_SECONDS) -> int:
-    """Exit code of work in a process of its own, a copy of this one, which has imported everything and computed
-    nothing. It is killed after some seconds."""
+def apart(work: Callable[[], object], log: Path) -> tuple[int, float]:
+    """Exit code and processor seconds of work in a process of its own, a copy of this one, which has imported
+    everything and computed nothing. It is killed after CELL_SECONDS of the processor, or WALL_SECONDS."""
     if (child := os.fork()) == 0:
         code = 1
         try:
             os.setsid()
+            resource.setrlimit(resource.RLIMIT_CPU, (CELL_SECONDS, CELL_SECONDS + 5))
             out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(out, stream)
@@ -386,12 +386,12 @@ def apart(work: Callable[[], object], log: Path, seconds: float = WALL_SECONDS) 
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
-    until = time.monotonic() + seconds
-    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
+    until = time.monotonic() + WALL_SECONDS
+    while (ended := os.wait4(child, os.WNOHANG))[0] == 0:
         if time.monotonic() > until:
             os.killpg(child, signal.SIGKILL)
         time.sleep(0.2)
-    return os.waitstatus_to_exitcode(ended[1])
+    return os.waitstatus_to_exitcode(ended[1]), ended[2].ru_utime + ended[2].ru_stime
 
 
 def inside(cell: Cell, folder: Path) -> None:
