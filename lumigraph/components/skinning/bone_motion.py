@@ -241,8 +241,8 @@ def clip_of(path: str, frame: Frame) -> BoneMotion:
 def smoothed_poses(
     turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " moment"]
 ) -> Float[Tensor, "moment bone 4"]:
-    """Unit quaternions of joints, each component on a smoothing spline over time. An exact body keeps its rotations, and
-    so do joints that turn too far from moment to moment to tell errors from motion."""
+    """Unit quaternions of joints, each component on a smoothing spline over time. An exact body keeps its rotations,
+    and so do joints that turn too far from moment to moment to tell errors from motion."""
     flips = torch.where((turns[1:] * turns[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).cumprod(0)
     even = torch.cat([turns[:1], turns[1:] * flips])
     fitted, variance = on_splines(even.flatten(1), times)
