@@ -64,7 +64,8 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
     learnt, held_out = ([one.psnr for one in checked.of(split)] for split in ("train", "test"))
     if learnt and held_out and not method.moves_cameras:  # poses of held-out photographs are not learnt
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
-        rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
+        beside = "" if method.complete else f", training photographs {psnr:.1f} dB"  # it shows these themselves
+        rows["held-out photographs"] = f"{other:.1f} dB{beside} ({ABOUT_RESIDUALS})"
         gap = psnr - other
     if not method.complete:
         rows["advice"] = advice(trend, enough, more, photographed(run, data))
