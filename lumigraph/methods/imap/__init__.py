@@ -22,7 +22,7 @@ from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINT
 from ...components.tracking.trajectory import Pose, apply_twists
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
+from ...files.ranges import BatchSize, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
 from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.method import Descend
 from ...volume import composite
@@ -73,6 +73,11 @@ class LossNumbers:
     smooth_weight: NonNegative = 0.0  # weight of differences between neighbours in the table, with --field hash
 
 
+FREQUENCY_DEVIATION = 25.0  # sigma of the Fourier features, section 3.1
+
+LAYERS = 4  # hidden layers of the network, section 3.1
+
+
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers, by section; those without one are not in the paper."""
@@ -84,9 +89,8 @@ class Config:
     mapping: FieldMappingNumbers = FieldMappingNumbers()
     terms: LossNumbers = LossNumbers()
     field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
-    layers: Annotated[int, between(1, 16)] = 4  # hidden layers of the network, section 3.1
+    colour_layers: Layers = 2  # hidden layers of the table's colour network; more cost time
     hidden_width: Width = 256  # channels of a hidden layer, section 3.1; wider holds more detail, and costs time
-    frequency_deviation: Positive = 25.0  # sigma of the Fourier features, section 3.1; higher holds finer detail
     truncation: Positive = 0.1  # metres at which the distance is truncated, with --field hash
     sharpness: Positive = 10.0  # steepness of density at a surface, per truncation, with --field hash
     learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
@@ -115,9 +119,11 @@ class IMap(FieldMethod):
         space, hashed = Box(frame.bounds, frame.near), c.field == "hash"
         with seeded(c.seed):
             if hashed:
-                self.network = DistanceTable(c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness)
+                self.network = DistanceTable(
+                    c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness, c.colour_layers
+                )
             else:
-                self.network = MapNetwork(c.layers, c.hidden_width, FREQUENCY_ROWS, c.frequency_deviation)
+                self.network = MapNetwork(LAYERS, c.hidden_width, FREQUENCY_ROWS, FREQUENCY_DEVIATION)
         self.sampler = MapSampler(space, c.rays, c.truncation * self.unit if hashed else None)
         self.tracker = Tracker(frame.image_count, c.tracking, self.unit)
         self.snapshot = copy.deepcopy(self.network).requires_grad_(False)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ...components.fields.coordinate_field import CoordinateField
-from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, GEOMETRY_FEATURES, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP
 from ...components.fields.spaces import Space
 from ...method import Field
@@ -29,7 +29,7 @@ class ObjectTable(HashField):
     def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, latent: int):
         super().__init__(numbers, hidden_width, space, reach)
         layers = [hidden_width] * DENSITY_LAYERS
-        self.density_network = MLP(numbers.width + latent, *layers, numbers.geometry_features)
+        self.density_network = MLP(numbers.width + latent, *layers, GEOMETRY_FEATURES)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
         assert code is not None
