@@ -730,7 +730,7 @@ def test_malformed_json(tiny, tmp_path):
         (lambda m: "no matrix", ("transform_matrix",)),
         (lambda m: m[:2], ("transform_matrix",)),
         (lambda m: [["a"] * 4] * 4, ("transform_matrix",)),
-        (lambda m: [[2 * x for x in row] for row in m], ("not rigid",)),
+        (lambda m: (np.array(m) @ np.diag([2, 1, 1, 1])).tolist(), ("not rigid",)),
         (lambda m: (np.array(m) @ np.diag([-1, 1, 1, 1])).tolist(), ("mirrored",)),
         (lambda m: np.zeros((4, 4)).tolist(), ("not rigid",)),
     ],
