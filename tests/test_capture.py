@@ -792,8 +792,8 @@ def test_colmap_images_that_are_elsewhere(tiny, tmp_path):
 
 
 def test_colmap_lenses_nobody_follows(tiny, tmp_path):
-    camera = pycolmap.Camera(model="FOV", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 0.1])
-    refuse(write_colmap(tmp_path, tiny, cameras=[camera]), "FOV", "image_undistorter")
+    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 0.5, 1.0])
+    refuse(write_colmap(tmp_path, tiny, cameras=[camera]), "EUCM", "image_undistorter")
 
 
 def test_damaged_llff(tiny, tmp_path):

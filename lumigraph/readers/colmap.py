@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..camera.lens import Division, Equirectangular, FieldOfView, Fisheye, Lens, OpenCV, Pinhole, ThinPrism
 from ..errors import LumigraphError
 from ..files import exists, explained, is_file, read_bytes, read_text
 from ..files.names import counted, natural
@@ -31,6 +31,9 @@ EXPECTED_FILES = "sparse/0 with cameras and images, .bin or .txt (COLMAP)"
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
 PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+ONE_BEND = {"FOV": FieldOfView, "SIMPLE_DIVISION": Division, "DIVISION": Division}
+THIN_PRISM = "THIN_PRISM_FISHEYE"
+PRISM_ORDER = [0, 1, 4, 5, 2, 3, 6, 7]  # of its k1 k2 p1 p2 k3 k4 sx1 sy1, for the lens here
 FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
@@ -267,7 +270,7 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
         )
     if kind == "EQUIRECTANGULAR":
         return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
-    if kind not in PLANAR and kind not in FISHEYE:
+    if kind not in (*PLANAR, *FISHEYE, *ONE_BEND, THIN_PRISM):
         raise LumigraphError(
             f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
             f"run COLMAP's image_undistorter and use its folder"
@@ -275,6 +278,10 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     parts = camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()
     focal, centre, bends = (p[None, list(part)] for part in parts)
     focal = focal.expand(1, 2).contiguous()
+    if kind == THIN_PRISM:
+        return ThinPrism(focal, centre, bends[:, PRISM_ORDER])
+    if kind in ONE_BEND:
+        return ONE_BEND[kind](focal, centre, bends)
     if kind in FISHEYE:
         return Fisheye(focal, centre, torch.nn.functional.pad(bends, (0, 4 - bends.shape[1])))
     if not bends.any():

@@ -7,8 +7,8 @@ alpha.
 
 labels/         class of each pixel, an integer: the layer `labels`. `lumigraph segment` writes such a folder.
 
-A mask is named after its photograph, image.png, image.jpg.png or image_mask.png for image.jpg, and has its shape, at any
-size. Masks in other places, whose meaning differs from program to program, are named in a sentence.
+A mask is named after its photograph, image.png, image.jpg.png or image_mask.png for image.jpg, and has its shape, at
+any size. Masks in other places, whose meaning differs from program to program, are named in a sentence.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     shots, missing = list(capture.shots), list(capture.missing)
     if (other := other_masks(shots, folder)) is not None:
         text = (
-            f"{other} is not used, for programs disagree on its meaning; put masks whose black pixels are to be ignored "
+            f"{other} is not used, for programs disagree on its meaning; put masks whose black pixels are ignored "
             f"into {folder / MASKS}, silhouettes into {folder / OBJECT_MASKS}"
         )
         capture = replace(capture, notes=[*capture.notes, text])

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
-from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, ThinPrism
 from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import from_json, is_file, read_bytes, read_json
@@ -52,6 +52,7 @@ BLENDER_EMPTY_DEPTHS = (1e10, 65504.0)  # depth that Blender writes for backgrou
 
 WITHOUT_BENDS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 WITH_BENDS = ("OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
+FISHEYES = ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
 LARGEST_RADIUS, BEYOND = 4.0, 1.05  # where a lens is fitted, at most; and times the radius of the picture's corner
 RIDGE = 1e-10  # singular values that count as none, of the largest
 
@@ -134,6 +135,8 @@ class Posed:
     k6: Bend | None = None
     p1: Bend | None = None
     p2: Bend | None = None
+    sx1: Bend | None = None
+    sy1: Bend | None = None
     time: Coordinate | None = None
     mask_path: Name | None = None
     depth_file_path: Name | None = None
@@ -319,8 +322,8 @@ def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     model = model_of(about)
     if model in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Equirectangular(row(width, height))
-    if model not in (*WITHOUT_BENDS, *WITH_BENDS, "OPENCV_FISHEYE"):
-        known = ", ".join((*WITHOUT_BENDS[:2], *WITH_BENDS, "OPENCV_FISHEYE"))
+    if model not in (*WITHOUT_BENDS, *WITH_BENDS, *FISHEYES):
+        known = ", ".join((*WITHOUT_BENDS[:2], *WITH_BENDS, *FISHEYES))
         raise LumigraphError(
             f"{where} has camera_model {model}; only {known} and EQUIRECTANGULAR are known, so undistort the "
             "photographs first"
@@ -334,6 +337,9 @@ def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     focal, centre = row(focal_x, focal_y), row(centre_x, centre_y)
     if model == "OPENCV_FISHEYE":
         return Fisheye(focal, centre, row(*(getattr(about, f"k{i}") or 0.0 for i in (1, 2, 3, 4))))
+    if model == "THIN_PRISM_FISHEYE":
+        names = ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1")
+        return ThinPrism(focal, centre, row(*(getattr(about, name) or 0.0 for name in names)))
     bends = [getattr(about, key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     if model in WITHOUT_BENDS or not any(bends):
         return Pinhole(focal, centre)
