@@ -7,7 +7,8 @@
     python benchmarks/strangers.py OUTPUT --publish                        the figures for docs/benchmarks.md
 
 A cell trains by `lumigraph train` or `track` and compares by `lumigraph eval`, in a process of its own and for a number
-of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for each cell:
+of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for
+each cell:
 
     outcome     ok; refused, with the sentence; crash; too slow, where a limit of seconds ended it
     score       the first of its evaluation, and beside it the baseline: the better one of mean and nearest training
@@ -46,7 +47,6 @@ from PIL import Image
 
 from lumigraph.commands.cli import main as command_line
 from lumigraph.datasets.scene import Scene
-from lumigraph.datasets.shapes import Shapes
 from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.run import evaluate_on
 from lumigraph.evaluation.tracking import ERRORS_FILE, TRUTH_FILE
@@ -55,7 +55,7 @@ from lumigraph.figures import contact_sheet
 from lumigraph.geometry import evenly
 from lumigraph.lab.benchmark.gallery import CAPTION_NUMBERS
 from lumigraph.lab.benchmark.table import table
-from lumigraph.metrics import intersection_over_union, scores_of
+from lumigraph.metrics import scores_of
 from lumigraph.readers.capture import Capture
 from lumigraph.run import Run
 
@@ -63,7 +63,6 @@ RESULTS = Path(__file__).parent / "results" / "strangers-cpu.json"
 CELL_SECONDS, WALL_SECONDS = 240, 1200  # of a cell at the most: of the processor, and by the clock
 EVAL_VIEWS, COVERED, SIDE = 4, 0.05, 160  # compared views; relative error of depth; pixels of photographs in --data
 SOLID = 0.5  # opacity of a surface
-HULL_POINTS = 50_000
 UNSAID = "its score is below the baseline, and no sentence says so"
 V = "size=96,views=24"
 ROOM = "procedural:room,depth,size=120,views="
@@ -426,9 +425,7 @@ def inside(cell: Cell, folder: Path) -> None:
     if isinstance(data, Scene) and "psnr" in result:
         measured["coverage"] = coverage(method, data)
         show(folder, data, result)
-    elif isinstance(data, Shapes):
-        measured["baseline"] = hull_score(data)
-    elif "psnr" not in result:
+    elif "baselines" not in result:
         fresh = evaluate_on(run.new_method("cpu").eval(), data, EvaluationOptions(views=EVAL_VIEWS))
         measured["baseline"] = first_score(fresh.to_json())["value"]
     (folder / "cell.json").write_text(json.dumps(measured))
@@ -455,19 +452,6 @@ def coverage(method: Any, scene: Scene) -> float | None:
         close = ((seen.depth - truth).abs() < COVERED * truth) & (seen.opacity > SOLID)
         there, right = there + int(known.sum()), right + int((known & close).sum())
     return right / there if there else None
-
-
-def hull_score(shapes: Shapes) -> float:
-    """IoU of the convex hull with a shape, mean over the shapes."""
-    from scipy.spatial import Delaunay
-
-    scores = []
-    for name in shapes.names:
-        shape = shapes[name]
-        points = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (HULL_POINTS, 3))).float()
-        hull = torch.from_numpy(Delaunay(shape.mesh.vertices).find_simplex(points.numpy()) >= 0)
-        scores.append(intersection_over_union(hull, shape.inside(points)))
-    return float(np.mean(scores))
 
 
 def show(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
