@@ -4,7 +4,7 @@
     python benchmarks/strangers.py OUTPUT --methods nerf neus --resume     more cells of the same table
     python benchmarks/strangers.py OUTPUT --data FOLDER                    methods of photographs on these, too
     python benchmarks/strangers.py OUTPUT --budget 0.2                     a fifth of each method's steps
-    python benchmarks/strangers.py OUTPUT --publish                        the figures for docs/benchmarks.md
+    python benchmarks/strangers.py OUTPUT --publish                        the figures for `tables.py`
 
 A cell trains by `lumigraph train` or `track` and compares by `lumigraph eval`, in a process of its own and for a number
 of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for
@@ -54,7 +54,6 @@ from lumigraph.figures import Row as Line
 from lumigraph.figures import contact_sheet
 from lumigraph.geometry import evenly
 from lumigraph.lab.benchmark.gallery import CAPTION_NUMBERS
-from lumigraph.lab.benchmark.table import table
 from lumigraph.metrics import scores_of
 from lumigraph.readers.capture import Capture
 from lumigraph.run import Run
@@ -217,7 +216,7 @@ class Options:
     settings: tuple[str, ...] = ()  # names of settings to run; all without
     budget: float = 1.0  # factor on each method's steps
     resume: bool = False  # keep finished cells of an earlier call
-    publish: bool = False  # copy results.json to benchmarks/results and write docs/benchmarks.md anew, then end
+    publish: bool = False  # write the figures of an earlier call to benchmarks/results instead
 
 
 @dataclass(frozen=True)
@@ -275,8 +274,7 @@ def main(options: Options) -> None:
     output = options.output.resolve()
     path = output / "results.json"
     if options.publish:
-        RESULTS.write_text(path.read_text("utf-8"), "utf-8")
-        return
+        return publish(json.loads(path.read_text("utf-8")))
     if path.exists() and not options.resume:
         raise SystemExit(f"{path} exists; go on with --resume, or name another folder")
     output.mkdir(parents=True, exist_ok=True)
@@ -478,6 +476,25 @@ def draw(method: str, cells: list[Cell], output: Path, results: dict[str, Result
         contact_sheet(method, ["photograph", "rendering"], lines).save(output / f"{method}.png")
 
 
+def publish(results: dict[str, Any]) -> None:
+    """Write the cells in the table's order to benchmarks/results, for `tables.py`."""
+    found = [Result(**row) for row in results["cells"].values()]
+    found.sort(key=lambda one: [*METHODS].index(one.method))
+    cells = [
+        {"method": one.method, "setting": one.setting, "verdict": verdict(one), "score": said(one)} for one in found
+    ]
+    words = "" if results["budget"] == 1 else f" --budget {results['budget']:g}"
+    about = results | {"cells": cells, "commands": [f"python benchmarks/strangers.py OUTPUT{words}"]}
+    RESULTS.write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+
+
+def verdict(result: Result) -> str:
+    """Column of a cell in the table."""
+    if result.outcome == "ok":
+        return ("below, unsaid" if result.fault else "below") if result.below else "above"
+    return result.outcome
+
+
 def described(result: Result) -> str:
     """A cell in a line."""
     if result.outcome != "ok":
@@ -497,27 +514,6 @@ def said(result: Result) -> str:
     value, unit = result.score["value"], result.score.get("unit", "")
     beside = "" if result.baseline is None else f" ({result.baseline:.3g})"
     return f"{result.score['name']} {value:.3g}{' ' if unit else ''}{unit}{beside}"
-
-
-def rows(results: dict[str, Any]) -> str:
-    """The table of docs/benchmarks.md, of the contents of results.json."""
-    lines = []
-    for row in sorted(
-        (Result(**row) for row in results["cells"].values()), key=lambda one: [*METHODS].index(one.method)
-    ):
-        covered = "" if row.coverage is None else f"{100 * row.coverage:.0f} %"
-        works = row.outcome if row.outcome != "ok" else "below the baseline" if row.below else "yes"
-        lines.append(
-            [
-                row.method,
-                row.setting,
-                works,
-                said(row) if row.outcome == "ok" else "",
-                covered,
-                f"{row.steps} of {row.expected}",
-            ]
-        )
-    return table(["method", "setting", "works", "score (baseline)", "coverage", "steps"], lines)
 
 
 def make_data(folder: Path, cells: list[Cell]) -> None:

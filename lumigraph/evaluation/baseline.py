@@ -29,8 +29,8 @@ def below(place: object, name: str, score: float, baselines: Mapping[str, float]
     if best is None or score >= baselines[best]:
         return None
     return (
-        f"{place} has {score:.2f} {name}, and the {best} alone {baselines[best]:.2f}: nothing was learnt that holds "
-        "beyond the training data; train for longer, or check the data with `lumigraph info` and compare another method"
+        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; train "
+        "for longer, or compare another method on these data"
     )
 
 
