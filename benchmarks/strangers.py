@@ -4,10 +4,11 @@
     python benchmarks/strangers.py OUTPUT --methods nerf neus --resume     more cells of the same table
     python benchmarks/strangers.py OUTPUT --data FOLDER                    methods of photographs on these, too
     python benchmarks/strangers.py OUTPUT --budget 0.2                     a fifth of each method's steps
-    python benchmarks/strangers.py OUTPUT --publish                        the figures for docs/benchmarks.md
+    python benchmarks/strangers.py OUTPUT --publish                        the figures for `tables.py`
 
 A cell trains by `lumigraph train` or `track` and compares by `lumigraph eval`, in a process of its own and for a number
-of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for each cell:
+of steps, so that other programs change its time alone. Seconds are the processor's. OUTPUT/results.json has for
+each cell:
 
     outcome     ok; refused, with the sentence; crash; too slow, where a limit of seconds ended it
     score       the first of its evaluation, and beside it the baseline: the better one of mean and nearest training
@@ -46,7 +47,6 @@ from PIL import Image
 
 from lumigraph.commands.cli import main as command_line
 from lumigraph.datasets.scene import Scene
-from lumigraph.datasets.shapes import Shapes
 from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.run import evaluate_on
 from lumigraph.evaluation.tracking import ERRORS_FILE, TRUTH_FILE
@@ -54,8 +54,7 @@ from lumigraph.figures import Row as Line
 from lumigraph.figures import contact_sheet
 from lumigraph.geometry import evenly
 from lumigraph.lab.benchmark.gallery import CAPTION_NUMBERS
-from lumigraph.lab.benchmark.table import table
-from lumigraph.metrics import intersection_over_union, scores_of
+from lumigraph.metrics import scores_of
 from lumigraph.readers.capture import Capture
 from lumigraph.run import Run
 
@@ -63,7 +62,6 @@ RESULTS = Path(__file__).parent / "results" / "strangers-cpu.json"
 CELL_SECONDS, WALL_SECONDS = 240, 1200  # of a cell at the most: of the processor, and by the clock
 EVAL_VIEWS, COVERED, SIDE = 4, 0.05, 160  # compared views; relative error of depth; pixels of photographs in --data
 SOLID = 0.5  # opacity of a surface
-HULL_POINTS = 50_000
 UNSAID = "its score is below the baseline, and no sentence says so"
 V = "size=96,views=24"
 ROOM = "procedural:room,depth,size=120,views="
@@ -218,7 +216,7 @@ class Options:
     settings: tuple[str, ...] = ()  # names of settings to run; all without
     budget: float = 1.0  # factor on each method's steps
     resume: bool = False  # keep finished cells of an earlier call
-    publish: bool = False  # copy results.json to benchmarks/results and write docs/benchmarks.md anew, then end
+    publish: bool = False  # write the figures of an earlier call to benchmarks/results instead
 
 
 @dataclass(frozen=True)
@@ -276,8 +274,7 @@ def main(options: Options) -> None:
     output = options.output.resolve()
     path = output / "results.json"
     if options.publish:
-        RESULTS.write_text(path.read_text("utf-8"), "utf-8")
-        return
+        return publish(json.loads(path.read_text("utf-8")))
     if path.exists() and not options.resume:
         raise SystemExit(f"{path} exists; go on with --resume, or name another folder")
     output.mkdir(parents=True, exist_ok=True)
@@ -426,9 +423,7 @@ def inside(cell: Cell, folder: Path) -> None:
     if isinstance(data, Scene) and "psnr" in result:
         measured["coverage"] = coverage(method, data)
         show(folder, data, result)
-    elif isinstance(data, Shapes):
-        measured["baseline"] = hull_score(data)
-    elif "psnr" not in result:
+    elif "baselines" not in result:
         fresh = evaluate_on(run.new_method("cpu").eval(), data, EvaluationOptions(views=EVAL_VIEWS))
         measured["baseline"] = first_score(fresh.to_json())["value"]
     (folder / "cell.json").write_text(json.dumps(measured))
@@ -457,19 +452,6 @@ def coverage(method: Any, scene: Scene) -> float | None:
     return right / there if there else None
 
 
-def hull_score(shapes: Shapes) -> float:
-    """IoU of the convex hull with a shape, mean over the shapes."""
-    from scipy.spatial import Delaunay
-
-    scores = []
-    for name in shapes.names:
-        shape = shapes[name]
-        points = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (HULL_POINTS, 3))).float()
-        hull = torch.from_numpy(Delaunay(shape.mesh.vertices).find_simplex(points.numpy()) >= 0)
-        scores.append(intersection_over_union(hull, shape.inside(points)))
-    return float(np.mean(scores))
-
-
 def show(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
     """Save the photograph of the first compared view as truth.png, and its rendering as seen.png."""
     name = result["views"][0]["name"]
@@ -494,6 +476,25 @@ def draw(method: str, cells: list[Cell], output: Path, results: dict[str, Result
         contact_sheet(method, ["photograph", "rendering"], lines).save(output / f"{method}.png")
 
 
+def publish(results: dict[str, Any]) -> None:
+    """Write the cells in the table's order to benchmarks/results, for `tables.py`."""
+    found = [Result(**row) for row in results["cells"].values()]
+    found.sort(key=lambda one: [*METHODS].index(one.method))
+    cells = [
+        {"method": one.method, "setting": one.setting, "verdict": verdict(one), "score": said(one)} for one in found
+    ]
+    words = "" if results["budget"] == 1 else f" --budget {results['budget']:g}"
+    about = results | {"cells": cells, "commands": [f"python benchmarks/strangers.py OUTPUT{words}"]}
+    RESULTS.write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+
+
+def verdict(result: Result) -> str:
+    """Column of a cell in the table."""
+    if result.outcome == "ok":
+        return ("below, unsaid" if result.fault else "below") if result.below else "above"
+    return result.outcome
+
+
 def described(result: Result) -> str:
     """A cell in a line."""
     if result.outcome != "ok":
@@ -513,27 +514,6 @@ def said(result: Result) -> str:
     value, unit = result.score["value"], result.score.get("unit", "")
     beside = "" if result.baseline is None else f" ({result.baseline:.3g})"
     return f"{result.score['name']} {value:.3g}{' ' if unit else ''}{unit}{beside}"
-
-
-def rows(results: dict[str, Any]) -> str:
-    """The table of docs/benchmarks.md, of the contents of results.json."""
-    lines = []
-    for row in sorted(
-        (Result(**row) for row in results["cells"].values()), key=lambda one: [*METHODS].index(one.method)
-    ):
-        covered = "" if row.coverage is None else f"{100 * row.coverage:.0f} %"
-        works = row.outcome if row.outcome != "ok" else "below the baseline" if row.below else "yes"
-        lines.append(
-            [
-                row.method,
-                row.setting,
-                works,
-                said(row) if row.outcome == "ok" else "",
-                covered,
-                f"{row.steps} of {row.expected}",
-            ]
-        )
-    return table(["method", "setting", "works", "score (baseline)", "coverage", "steps"], lines)
 
 
 def make_data(folder: Path, cells: list[Cell]) -> None:

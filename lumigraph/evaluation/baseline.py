@@ -1,12 +1,17 @@
-"""Trivial baseline of held-out photographs: pictures that need no method, the mean and the nearest training photograph.
+"""Trivial baselines, which need no training: the mean and the nearest training photograph in place of a held-out one,
+the convex hull in place of a shape.
 
-A method that shows held-out photographs worse than these has learnt nothing of the scene that they do not have.
+A method with a lower score shows nothing of its data that these do not show; `below` says so in a sentence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, Delaunay, QhullError
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -16,6 +21,26 @@ from ..readers.views import distances, pose_points
 
 MAX_AVERAGED = 64  # training photographs in the mean picture
 Picture = Float[Tensor, "height width 3"]
+
+
+def below(place: object, name: str, score: float, baselines: Mapping[str, float]) -> str | None:
+    """Sentence for a score that is lower than the best trivial baseline; None for another one. name: with the unit"""
+    best = max(baselines, key=lambda one: baselines[one], default=None)
+    if best is None or score >= baselines[best]:
+        return None
+    return (
+        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; train "
+        "for longer, or compare another method on these data"
+    )
+
+
+def in_hull(vertices: Float[np.ndarray, "vertex 3"], points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"] | None:
+    """Mask of the points inside the convex hull of vertices; None for flat ones."""
+    try:
+        hull = Delaunay(vertices[ConvexHull(vertices).vertices])
+    except (QhullError, ValueError):
+        return None
+    return torch.from_numpy(hull.find_simplex(points.numpy()) >= 0)
 
 
 class Baselines:

@@ -61,7 +61,7 @@ def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:
 
 
 def pose_points(cameras: Camera) -> Float[Tensor, "camera 6"]:
-    """Positions, in units of their deviation, and viewing directions of cameras, between which distances are compared."""
+    """Positions, in units of their deviation, and viewing directions of cameras, between which distances are taken."""
     position, direction = cameras.position, cameras.pose[:, :, 2]
     centred = position - position.mean(0)
     deviation = centred.square().sum(-1).mean().sqrt().clamp_min(1e-9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +74,7 @@ class Residual:
     psnr:     dB, after a gain and an offset per colour
     mirrored: the same of the mirrored photograph
     floating: share of its rendered surface that other cameras see through (floaters)
+    baselines: psnr of trivial stand-ins for a held-out photograph
     """
 
     photograph: str
@@ -81,6 +82,7 @@ class Residual:
     psnr: float
     mirrored: float
     floating: float
+    baselines: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
