@@ -15,7 +15,7 @@ from numba import njit, prange
 
 @njit(inline="always")
 def depth_at(depth, x, y, edge):
-    """Bilinear depth between pixels' centres, and True; where one of the four is NaN, that of the pixel at (x, y), which
+    """Bilinear depth between pixel centres, and True; where one of the four is NaN, that of the pixel at (x, y), which
     may be NaN. At a depth edge, where the known ones differ by `edge`, the least and False."""
     height, width = depth.shape
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
