@@ -153,7 +153,7 @@ class LabelledOptions(StrokeOptions):
         self.output.write_text(json.dumps({"scene": self.scene, "things": rows, "miou": mean.tolist()}, indent=1))
 
     def alone(self, method: Any, scene: Any, number: int) -> float:
-        """Intersection over union of what is seen of an instance that stands alone, over the held-out labelled views."""
+        """Intersection over union of what is seen of an instance alone, over the held-out labelled views."""
         both = either = 0
         for i in scene.splits["test"].tolist():
             whole, own = method.render(scene.cameras[i]), method.given(edit=f"alone {number}").render(scene.cameras[i])
