@@ -45,7 +45,13 @@ def adaptive(count: int, threshold: float) -> AdaptiveDensity:
 
 
 EVERY_ADDITION = {
-    "gaussian-splatting": {"objects": "yes", "filter_3d": True, "few_views": "yes", "robust": "yes", "appearance": "yes"},
+    "gaussian-splatting": {
+        "objects": "yes",
+        "filter_3d": True,
+        "few_views": "yes",
+        "robust": "yes",
+        "appearance": "yes",
+    },
     "deformable-splatting": {"nodes": 20},
     "planar-splatting": {"appearance": "yes"},
 }
@@ -53,8 +59,7 @@ EVERY_ADDITION = {
 
 @pytest.mark.parametrize("name", EVERY_ADDITION)
 def test_all_additions_follow_a_cloud_that_grows_and_is_pruned_in_one_step(name, monkeypatch):
-    """The cloud is doubled, then loses a part, before anything else has seen it; in the next step in the other order.
-    """
+    """The cloud is doubled, then loses a part, before anything else has seen it; next time in the other order."""
     scene, kind = tiny.scene(), methods.find(name)
     if name == "deformable-splatting":
         scene = replace(scene, frame=replace(scene.frame, times=(0.0, 1.0)))
@@ -74,7 +79,12 @@ def test_all_additions_follow_a_cloud_that_grows_and_is_pruned_in_one_step(name,
         step.learnt.prune(keep)
         counts.append(len(step.learnt))
 
-    held = [(part, x) for part in method.additions for x in getattr(part, "grows", ()) if len(getattr(part, x)) == len(method.cloud)]
+    held = [
+        (part, x)
+        for part in method.additions
+        for x in getattr(part, "grows", ())
+        if len(getattr(part, x)) == len(method.cloud)
+    ]
     assert len(held) >= {"gaussian-splatting": 3, "deformable-splatting": 4, "planar-splatting": 2}[name]
     for number, changes in enumerate([(grow, prune), (prune, grow), (grow, prune)]):
         for part, change in zip((method.density_control, method.tidying), changes, strict=True):

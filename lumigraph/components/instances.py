@@ -21,7 +21,7 @@ from ..method.controls import Configured, Control
 
 LABELS = "labels"
 BESIDE = "beside"  # layer of `with_beside`
-BESIDE_REACH = 0.06  # share of a photograph's longer side, within which another label is beside a pixel
+BESIDE_REACH = 0.2  # share of a photograph's longer side, within which another label is beside a pixel
 MIN_LABEL_VIEWS = 4  # photographs that should show an instance
 MOVE, COPY, REMOVE, ALONE = EDITS = "move", "copy", "remove", "alone"
 AXES = "x", "y", "z"
@@ -105,7 +105,9 @@ def check_labels(scene: Scene) -> None:
 def warn_of_few_views(scene: Scene) -> None:
     """Warn of labels that hardly any training photograph shows."""
     layer, train = scene.layers[LABELS], scene.splits["train"].tolist()
-    views = Counter[int](x for i in train if layer.planes[i] for x in np.unique(layer.stored(i)[layer.known(layer.stored(i))]).tolist())
+    views = Counter[int](
+        x for i in train if layer.planes[i] for x in np.unique(layer.stored(i)[layer.known(layer.stored(i))]).tolist()
+    )
     few = [label for label, count in sorted(views.items()) if count < MIN_LABEL_VIEWS]
     if few:
         warnings.warn(
@@ -126,7 +128,7 @@ def with_beside(scene: Scene) -> Scene:
     def beside(image: int) -> np.ndarray:
         stored, chance = layer.stored(image), np.random.default_rng(image)
         shape = np.array(stored.shape[:2])
-        angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * shape.max() * chance.random(shape)
+        angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * shape.max() * chance.random(shape) ** 2
         moved = np.indices(shape) + np.rint(away * np.stack([np.sin(angle), np.cos(angle)])).astype(int)
         row, column = np.clip(moved, 0, (shape - 1)[:, None, None])
         return stored[row, column]
