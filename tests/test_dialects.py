@@ -253,7 +253,8 @@ def test_files_of_other_programs_are_named_with_a_way_out(tmp_path, name, words)
     ("name", "text", "words"),
     [("cameras.xml", "<document/>", "Metashape"), ("bundle.out", "# Bundle file v0.3", "Bundler"),
      ("images/a.xmp", "xcr:Position", "RealityScan"), ("a.csv", "#name,x,y,alt", "RealityScan"),
-     ("cameras_sphere.npz", "", "NeuS"), ("reconstruction.json", "[]", "OpenSfM"), ("a.csv", "price", "no camera poses")],
+     ("cameras_sphere.npz", "", "NeuS"), ("reconstruction.json", "[]", "OpenSfM"),
+     ("a.csv", "price", "no camera poses")],
 )  # fmt: skip
 def test_poses_of_other_programs_are_named_with_a_way_out(tiny, tmp_path, name, text, words):
     tiny.write_images(tmp_path / "images")
