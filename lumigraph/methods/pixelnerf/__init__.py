@@ -50,7 +50,6 @@ DEPTH_DEVIATION = 0.01  # standard deviation of these, as a share of the ray's l
 BLOCKS = 5  # residual blocks of the network, appendix B.1
 VIEW_BLOCKS = 3  # blocks of these before the mean over views, appendix B.1
 TARGETS = 4  # photographs of a member that a step's rays come from
-FINAL_LEARNING_RATE = 1e-4  # learning rate at the end of the budget, reached exponentially
 BFLOAT16 = True  # multiply in bfloat16 where the processor is fast at it
 
 
@@ -76,6 +75,7 @@ class Config:
     rays_per_member: BatchSize = 128  # rays of each scene in a step; more reduce noise, and cost time
     boxed: Share = 0.75  # share of the budget in which rays go through boxes around opaque pixels, appendix B.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     empty_threshold: Share = 0.0  # coarse opacity below which a ray has no fine pass; higher is faster
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -150,7 +150,7 @@ class PixelNeRF(RayMethod):
         return Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16,
             density="softplus", density_scale=5.0, source_views=2,
             coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96,
-            learning_rate=1e-2)  # fmt: skip
+            learning_rate=1e-2, final_learning_rate=3e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
