@@ -344,18 +344,13 @@ class HypNeRF(RayMethod):
         """Bytes of the photographs' sampled pixels, as rays."""
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The field fitted to an object's photographs: first its code, then its tensors (section 3.3); or another
-        trained one."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, HypNeRF)
-        told._shown = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("instance", None)
-            told._find(scene)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Fit the field to an object's photographs: first its code, then its tensors (section 3.3)."""
+        self._shown = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("instance", None)
+            self._find(scene)
 
     def drawn(self, seed: int) -> Method:
         """A random object: a code from the Gaussian fitted to the trained codes."""

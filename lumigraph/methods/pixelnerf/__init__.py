@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -36,7 +37,7 @@ from ...files.ranges import (
     Width,
     between,
 )
-from ...method import Method, RayMethod
+from ...method import RayMethod
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.views import spread_out
@@ -220,19 +221,15 @@ class PixelNeRF(RayMethod):
     def evidence_views(self) -> int | None:
         return int(float(self.control("views"))) if self.controls else 1
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """A field of a scene, conditioned on its training photographs; or the same one, on fewer of them."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, PixelNeRF)
-        told._sources = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("views", None)
-            told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Condition the field on a scene's training photographs, or on fewer of them."""
+        self._sources = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("views", None)
+            self.kept = self._keeping(scene, len(scene.splits["train"])).to(self.device)
             with torch.no_grad():
-                told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
-        return told
+                self.kept.found.rows = self._features(self.kept.pictures()).flatten(0, 2)
 
     def evidence_bytes(self, scene: Scene) -> int:
         """Bytes of the photographs and their features."""
