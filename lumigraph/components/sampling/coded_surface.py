@@ -69,11 +69,10 @@ class CodedSurface(SurfaceMethod):
                 self.frame = one.frame
             self._show(self.find(one))
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """The method with a generated shape: a code sampled from the Gaussian of the trained ones."""
-        told = super().given()
-        assert isinstance(told, CodedSurface)
-        told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
+        told: Any = self.given()
+        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:

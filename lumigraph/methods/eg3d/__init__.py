@@ -442,10 +442,9 @@ class EG3D(Method):
             *((Control("picture", FINAL, choices=(FINAL, VOLUME), about=picture),) if self.generator.upscaling else ()),
         )
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A generated object, from a random code."""
-        told = self.given()
-        assert isinstance(told, EG3D)
+        told: Any = self.given()
         told._show(self._styles_of([seed]))
         return told
 

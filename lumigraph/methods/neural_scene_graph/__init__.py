@@ -257,7 +257,7 @@ class NeuralSceneGraph(FieldMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Errors of composited colours, and the prior of codes (eq. 10)."""
         c, generator = self.config, self.random(step)
-        rays = self.moved(batch.rays)
+        rays = self.refine_rays(batch.rays)
         passes, terms = self.learn_along(rays, generator)
         instances = self.instance_looks(rays, generator)
         background = backdrop(batch, self.background, generator, opaque=self.sampler.is_open)

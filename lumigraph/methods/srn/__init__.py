@@ -244,11 +244,10 @@ class SRN(RayMethod):
             self.frame = replace(scene.frame, has_alpha=self.frame.has_alpha)
             self._show(self._code_of(scene))
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A random scene: a code from the Gaussian fitted to the trained codes."""
-        told = super().given()
-        assert isinstance(told, SRN)
-        told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
+        told: Any = self.given()
+        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:
