@@ -28,7 +28,6 @@ AXES = "x", "y", "z"
 CONTROLS = {"edit", "turn", *(f"shift_{axis}" for axis in AXES)}
 SHIFT, TURN = (f"{change} of what is moved or copied" for change in ("Shift", "Rotation"))
 NOT_AN_INSTANCE = -1  # label of pixels that show no object, or an unknown one
-MAX_LABEL = 255  # the largest label that names an instance
 OPAQUE_ALPHA = 0.5
 
 

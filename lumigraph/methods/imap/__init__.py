@@ -74,8 +74,6 @@ class LossNumbers:
     smooth_weight: NonNegative = 0.0  # weight of differences between neighbours in the table, with --field hash
 
 
-FREQUENCY_DEVIATION = 25.0  # sigma of the Fourier features, section 3.1
-
 LAYERS = 4  # hidden layers of the network, section 3.1
 
 
@@ -92,6 +90,7 @@ class Config:
     field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
     colour_layers: Layers = 2  # hidden layers of the table's colour network; more cost time
     hidden_width: Width = 256  # channels of a hidden layer, section 3.1; wider holds more detail, and costs time
+    frequency_deviation: Positive = 25.0  # sigma of the Fourier features, section 3.1; higher holds finer detail
     truncation: Positive = 0.1  # metres at which the distance is truncated, with --field hash
     sharpness: Positive = 10.0  # steepness of density at a surface, per truncation, with --field hash
     learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
@@ -124,7 +123,7 @@ class IMap(FieldMethod):
                     c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness, c.colour_layers
                 )
             else:
-                self.network = MapNetwork(LAYERS, c.hidden_width, FREQUENCY_ROWS, FREQUENCY_DEVIATION)
+                self.network = MapNetwork(LAYERS, c.hidden_width, FREQUENCY_ROWS, c.frequency_deviation)
         self.sampler = MapSampler(space, c.rays, c.truncation * self.unit if hashed else None)
         self.tracker = Tracker(frame.image_count, c.tracking, self.unit)
         self.snapshot = copy.deepcopy(self.network).requires_grad_(False)
