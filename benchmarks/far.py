@@ -56,11 +56,13 @@ class Options:
     downscale: int = 8
 
 
+@torch.no_grad()
 def main(options: Options) -> None:
-    moved = moved_capture(options.capture, options.output / "capture")
     run = options.output / "run"
-    words = ["--steps", str(options.steps), "--downscale", str(options.downscale)]
-    lumigraph("train", "gaussian-splatting", moved, *words, "--output", run)
+    if not run.exists():
+        moved = moved_capture(options.capture, options.output / "capture")
+        words = ["--steps", str(options.steps), "--downscale", str(options.downscale)]
+        lumigraph("train", "gaussian-splatting", moved, *words, "--output", run)
     opened = open_any(run)
     cloud = needs(opened.method(), HasGaussians).gaussians().to("cpu")
     size = float(cloud.log_scales.double().mean(-1).exp().median()) * opened.frame.to_export.scale
