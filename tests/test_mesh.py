@@ -6,6 +6,7 @@ import json
 import math
 import struct
 import sys
+import warnings
 from collections import defaultdict
 from dataclasses import replace
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.depth_maps import Tolerance, agreed, render_depth_maps
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
@@ -156,6 +157,40 @@ def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
     mesh = extract_mesh(Seen(ball(), frame), around(), MeshOptions(cell_size=CELL, extent=2.0))
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
+
+
+class Scanned(Seen):
+    """A room of 8 x 6 x 3 whose walls were measured, around a box of interest of 2."""
+
+    def __init__(self):
+        super().__init__(ball(), OPEN)
+
+    def mesh(self) -> Mesh:
+        room = trimesh.creation.box((8.0, 6.0, 3.0)).subdivide().subdivide().subdivide()
+        colours = np.full((len(room.vertices), 3), 9, np.uint8)
+        return Mesh(np.array(room.vertices), np.array(room.faces), colours)
+
+
+def test_a_measured_mesh_is_whole_and_a_cut_is_said():
+    options = MeshOptions(smooth=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh = extract_mesh(Scanned(), around(), options)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (8, 6, 3))
+    with pytest.warns(LumigraphWarning, match=r"outside the meshed region and is left out; a larger --extent") as said:
+        part = extract_mesh(Scanned(), around(), replace(options, extent=3.5))
+    whole, kept = (float(as_trimesh(x).area) for x in (mesh, part))
+    assert f"{100 * (1 - kept / whole):.2g} %" in str(said[0].message) and kept < 0.7 * whole
+    assert (part.vertices.max(0) <= 3.5).all()
+
+
+def test_what_a_box_cuts_is_said():
+    """A ball of radius 1.4 that a box of interest of half-size 1 cuts."""
+    cameras, big = around(), Seen(ball(1.4), Frame(near=0.1, reach=4.0))
+    with pytest.warns(LumigraphWarning, match="of the surface lies outside the meshed region"):
+        extract_mesh(big, cameras, MeshOptions(cell_size=1 / 8, extent=1.0))
+    with pytest.warns(LumigraphWarning, match="of the surface lies outside the crop"):
+        extract_points(big, cameras, PointsOptions(count=100), Sphere((1.4, 0.0, 0.0), 1.0))
 
 
 def test_smoothing_takes_noise_and_leaves_the_volume():

@@ -24,6 +24,7 @@ from ..system.progress import counting, track
 from ..system.work import at_work
 from .loaded import Loaded
 from .options import PointsOptions
+from .surface import name_cut
 
 CANDIDATES_PER_POINT = 4  # pixels that are considered for each point
 MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
@@ -77,6 +78,9 @@ def extract_points(
     method.eval()
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
     good = [wanted(seen, crop) for seen in depth_maps]
+    if crop is not None:
+        kept, every = (sum(int(x.sum()) for x in masks) for masks in (good, [wanted(x, None) for x in depth_maps]))
+        name_cut(1 - kept / max(every, 1), "lies outside the crop", "a larger one holds more")
     share = min(1.0, CANDIDATES_PER_POINT * options.count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []

@@ -3,6 +3,7 @@ meshes: removal of small pieces, smoothing, simplification."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,11 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from ..depth_maps.level_set import zero_level_of_blocks
+from ..errors import LumigraphWarning
 from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
 BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
 SHORTEST = 1e-30  # vector that has a direction
+MIN_CUT = 0.005  # share of a surface, from which on it is said to be left out
 MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
 Vertices = Float[np.ndarray, "vertex 3"]
@@ -107,7 +110,15 @@ def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.
     visible = np.bincount(piece[seen], minlength=len(areas)) > 0
     areas = np.where(visible, areas, 0)
     keep = visible & (areas >= share * areas.max())
+    name_cut(areas[~keep].sum() / max(areas.sum(), 1e-30), "is in small pieces", "a smaller --keep keeps more of them")
     return compact(vertices, faces[keep[piece[faces[:, 0]]]])
+
+
+def name_cut(share: float, where: str, way_out: str) -> None:
+    """Warn of a share of the surface that an export leaves out."""
+    if share >= MIN_CUT:
+        sentence = f"{100 * share:.2g} % of the surface {where} and is left out; {way_out}"
+        warnings.warn(sentence, LumigraphWarning, stacklevel=3)
 
 
 def majority(chosen: Bool[np.ndarray, " vertex"], faces: Faces, times: int) -> Bool[np.ndarray, " vertex"]:
