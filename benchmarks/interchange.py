@@ -35,7 +35,7 @@ import numpy as np
 import torch
 import trimesh
 import tyro
-from foreign.readers import of_columns
+from foreign.packages import of_columns
 from scipy.spatial import cKDTree
 from tables import markdown
 
@@ -47,7 +47,7 @@ from lumigraph.export.points import PointCloud, write_points
 from lumigraph.export.texture.atlas import unwrap
 from lumigraph.files.ply import columns, read_rows
 from lumigraph.gaussians import Gaussians
-from lumigraph.geometry import to_matrix
+from lumigraph.geometry import evenly, to_matrix
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.large import open_any
 from lumigraph.method.capabilities import HasGaussians, needs
@@ -102,6 +102,7 @@ class Options:
     tools: tyro.conf.Positional[Path]
     sources: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Runs and files of Gaussians, beside the made cloud."""
+    most: int = 20_000  # Gaussians of a source, evenly chosen
     output: Path = RESULTS
     pictures: Path | None = None
     """Folder for what three.js draws."""
@@ -154,7 +155,7 @@ class Tools:
 
     def package(self, reader: str, path: Path) -> tuple[Found, str]:
         result = path.with_name(f"{path.name}.npz")
-        said = ran([self.python, HERE / "foreign/readers.py", reader, path, result])
+        said = ran([self.python, HERE / "foreign/packages.py", reader, path, result])
         with np.load(result) as found:
             return dict(found), said.split("version ")[-1].strip()
 
@@ -391,25 +392,35 @@ def page_table(rows: list[dict[str, Any]], date: str) -> str:
     return "\n".join([f"Measured {date}.", "", *markdown(lines), "", *markdown(files), ""])
 
 
+@torch.no_grad()
 def main(options: Options) -> None:
     clouds = {"made": made()}
     for source in options.sources:
         opened = open_any(source)
-        clouds[source.stem] = needs(opened.method(), HasGaussians).gaussians().to("cpu")
+        cloud = needs(opened.method(), HasGaussians).gaussians().to("cpu")
+        clouds[source.stem] = cloud[torch.tensor(evenly(range(len(cloud)), options.most))]
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name, browser(options.tools, Path(name)) as page:
         tools = Tools(options.tools.resolve(), page, Path(name), options.pictures)
         (folder := Path(name) / "surface").mkdir()
-        rows = [*of_mesh(tools, folder)]
+        for one in of_mesh(tools, folder):
+            keep(rows, one, options.output)
         for number, (cloud_name, cloud) in enumerate(clouds.items()):
             (folder := Path(name) / f"{number}-{cloud_name}").mkdir()
-            rows += of_cloud(tools, cloud_name, cloud, folder)
-    written = {"date": datetime.date.today().isoformat(), "rows": [asdict(one) for one in rows]}
-    options.output.write_text(json.dumps(written, indent=1) + "\n", "utf-8")
-    table = page_table(written["rows"], written["date"])
+            for one in of_cloud(tools, cloud_name, cloud, folder):
+                keep(rows, one, options.output)
+    table = page_table(rows, datetime.date.today().isoformat())
     console().print(table)
     PAGE.write_text(TABLE.sub(lambda found: found[1] + table, PAGE.read_text("utf-8")), "utf-8")
+
+
+def keep(rows: list[dict[str, Any]], one: Row, output: Path) -> None:
+    """Add a row, and write all that there are."""
+    rows.append(asdict(one))
+    written = {"date": datetime.date.today().isoformat(), "rows": rows}
+    output.write_text(json.dumps(written, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Readers of other packages, run by a Python that has them: readers.py NAME FILE RESULT.npz.
+"""Readers of other packages, run by a Python that has them: packages.py NAME FILE RESULT.npz.
 
 The result has what the package gives, in the file's axes: positions, quaternions (w, x, y, z), log_scales, opacities
 from 0 to 1, colours (harmonics of degree 0) and rest (of higher degrees). It prints the version. It imports nothing of
@@ -80,6 +80,7 @@ def open3d(path: Path) -> Found:
     point = open3d.t.io.read_point_cloud(str(path)).point
     names = {"quaternions": "rot", "log_scales": "scale", "colours": "f_dc", "rest": "f_rest"}
     found = {ours: point[theirs].numpy() for ours, theirs in names.items() if theirs in point}
+    found["log_scales"] = np.log(found["log_scales"].astype(np.float64))  # it gives standard deviations
     return found | {"positions": point.positions.numpy(), "opacities": of_logits(point["opacity"].numpy())}
 
 
