@@ -172,6 +172,11 @@ def open_scene(
         capture = read_capture(source, reader)
     if unposed is not None:
         capture = without_poses(capture, typed(Unposed, unposed, str(source)) if isinstance(unposed, dict) else unposed)
+    if capture.poseless:
+        raise LumigraphError(
+            f"{source} has colours and depth without poses; find them from both: lumigraph track splat-slam "
+            f"{source}, or from the colours alone: lumigraph capture {source}"
+        )
     if part is not None:
         capture = part_of(capture, typed(CapturePart, part, str(source)) if isinstance(part, dict) else part)
     if depth_from is not None:

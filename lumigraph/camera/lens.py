@@ -366,7 +366,7 @@ class ThinPrism(Fisheye):
 class FieldOfView(Lens):
     """Fisheye lens of one parameter (Devernay and Faugeras 2001; COLMAP's FOV), on the plane z = 1:
 
-        r -> atan(2 r tan(omega / 2)) / omega
+    r -> atan(2 r tan(omega / 2)) / omega
     """
 
     focal: Float[Tensor, "camera 2"]
@@ -400,7 +400,7 @@ class FieldOfView(Lens):
 class Division(FieldOfView):
     """Lens whose distortion is a division (Fitzgibbon 2001; COLMAP's DIVISION), on the plane z = 1:
 
-        r of the picture -> r / (1 + k r^2) without distortion.    omega: k
+    r of the picture -> r / (1 + k r^2) without distortion.    omega: k
     """
 
     def straight(self, r: Tensor, index: Tensor | None) -> Tensor:
