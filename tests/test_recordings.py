@@ -1,4 +1,4 @@
-"""Recordings of depth cameras and of rigs, in the layouts of apps and benchmarks: cameras, moments, depth and splits."""
+"""Recordings of depth cameras and of rigs, as apps and benchmarks write them: cameras, moments, depth and splits."""
 
 from __future__ import annotations
 
