@@ -170,6 +170,15 @@ def is_splat_file(path: Path | str) -> bool:
     return path.name.lower().endswith(SUFFIXES) and not moving_ply.has_motion(path)
 
 
+def holds_points(path: Path | str) -> bool:
+    """True for a .ply of points or triangles, which names no property of Gaussians."""
+    path = expanded(path)
+    if not (path.name.lower().endswith(".ply") and path.is_file()):
+        return False
+    here = {name for names in read_header(path).properties.values() for name in names}
+    return not here & {*ply.COLOUR, *ply.OPACITY, *ply.SCALE, *ply.ROTATION, "packed_position"}
+
+
 def names_splats(path: Path | str) -> bool:
     """True if `write_gaussians` accepts a name, independent of existing files."""
     path = expanded(path)
