@@ -69,7 +69,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
         rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
         gap = psnr - other
-        warn_below(run, checked.of("test"))
+        warn_below(run, method, checked.of("test"))
     if not method.complete:
         rows["advice"] = advice(trend, enough, more, photographed(run, data))
     if enough and not method.complete and gap > MEMORISED_DB:
@@ -122,7 +122,7 @@ def examined(run: Any, method: Method, data: Any, turn: Any) -> Examined:
         return Examined()
 
 
-def warn_below(run: Any, held_out: Sequence[Residual]) -> None:
+def warn_below(run: Any, method: Method, held_out: Sequence[Residual]) -> None:
     """Warn where renderings of held-out photographs are worse than trivial stand-ins."""
     from ..evaluation.baseline import below
 
