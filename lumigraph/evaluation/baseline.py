@@ -33,8 +33,8 @@ def below(place: object, name: str, score: float, baselines: Mapping[str, float]
         return None
     longer = "" if complete else "train for longer, or "
     return (
-        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; {longer}"
-        "compare another method on these data"
+        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; "
+        f"{longer}compare another method on these data"
     )
 
 
