@@ -67,7 +67,8 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
     learnt, held_out = ([one.psnr for one in checked.of(split)] for split in ("train", "test"))
     if learnt and held_out and not method.moves_cameras:  # poses of held-out photographs are not learnt
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
-        rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
+        beside = "" if method.complete else f", training photographs {psnr:.1f} dB"  # it shows these themselves
+        rows["held-out photographs"] = f"{other:.1f} dB{beside} ({ABOUT_RESIDUALS})"
         gap = psnr - other
         warn_below(run, method, checked.of("test"))
     if not method.complete:
@@ -81,7 +82,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
 
 def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
     """Write the trajectory of a run and print its errors, lost frames and next commands."""
-    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
+    from ..evaluation.tracking import DRIFT_FILE, PATH_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
 
     state, sequence = outcome.state, method.tracker.sequence(data)
     followed = min(state.step, len(sequence))
@@ -96,6 +97,7 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     if not outcome.finished:
         say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
     rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
+    rows |= {"path": str(run.folder / PATH_FILE)} if found.map else {}
     if found.lost:
         names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
         more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""

@@ -22,6 +22,8 @@ from ..exchange.packing import Stored
 from .controls import Control, Value
 from .part import Part
 
+SEED_STRIDE = 0x9E3779B1  # between the generators of two seeds, odd (Knuth 1998, section 6.4)
+
 
 @runtime_checkable
 class Lesson(Protocol):
@@ -283,8 +285,9 @@ class Method(nn.Module, ABC):
         raise LumigraphError(f"{cls.__name__} cannot be made of {type(other).__name__}; it learns from data alone")
 
     def random(self, number: int) -> torch.Generator:
-        """Random generator seeded by the config's seed and a number, such as the step, for exact resuming."""
-        return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
+        """Random generator seeded by the config's seed and a number, such as the step, for exact resuming. Of its own
+        seed PyTorch's CPU generator reads the low 32 bits alone."""
+        return torch.Generator().manual_seed((SEED_STRIDE * self.config.seed + number) % (1 << 32))
 
     @property
     def device(self) -> torch.device:

@@ -43,6 +43,7 @@ MIRRORED_PSNR = 1.5  # dB by which a mirrored photograph must fit its rendering 
 BLURRED = "blurred"  # fault of a photograph
 FOLDED = "folded cameras"  # fault of a capture whose cameras leap where its photographs do not
 LACKING = "lacking directions"  # fault of a capture with directions that lack photographs
+TURNING = "turning subject"  # fault of a capture whose subject turned before a background at rest
 
 Array = Float[np.ndarray, " photo"]
 

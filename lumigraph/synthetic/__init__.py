@@ -38,6 +38,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Pinhole
+from ..color.tags import save_srgb
 from ..datasets.world import BlockLabels
 from ..geometry import Similarity
 from ..readers.capture import Capture, PixelPlane, Shot
@@ -320,7 +321,7 @@ def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> No
             seen = render(stage.world_of(cameras[i]), cameras[i])
             path = f"{split}/r_{i:04d}"
             pixels = eight_bits(seen.rgb.numpy(), seen.opacity.numpy(), alpha=not stage.world.sky.visible)
-            Image.fromarray(pixels).save(folder / f"{path}.png")
+            save_srgb(Image.fromarray(pixels), folder / f"{path}.png")
             if truth:
                 known = {k: v.numpy() for k, v in (("depth", seen.depth), *seen.extra.items())}
                 known["names"] = np.array(stage.world.names)
