@@ -152,7 +152,7 @@ GUIDED = ("--guidance", "{data}/captions")
 
 @dataclass(frozen=True)
 class Entry:
-    """A method's line of the table: steps of half a minute or less on an idle core, 0 for all frames; settings; options."""
+    """A method's line of the table. steps: of half a minute or less on an idle core, 0 for all frames"""
 
     steps: int
     settings: tuple[str, ...]
