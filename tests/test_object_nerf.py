@@ -88,7 +88,7 @@ def test_photographs_without_labels_are_refused():
     bare.images.has_alpha = False
     try:
         with pytest.raises(LumigraphError, match="folder `labels` beside them"):
-            new().begin(bare)
+            new().check_data(bare)
     finally:
         bare.images.has_alpha = True
 

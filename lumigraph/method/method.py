@@ -150,6 +150,10 @@ class Method(nn.Module, ABC):
         """True if training is complete at any budget, such as after the last photograph of a fusion."""
         return False
 
+    def check_data(self, data: Any) -> None:
+        """Raise LumigraphError for data that this method cannot learn from; called before a new run compiles or learns
+        anything. Nothing is refused by default."""
+
     def begin(self, data: Any, seconds: float = math.inf) -> None:
         """Initialise from the data; called once, before the first step of a new run.
 
