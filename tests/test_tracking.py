@@ -222,15 +222,17 @@ def tracker_of(frames: list[DepthFrame], first: torch.Tensor) -> tuple[Tracker, 
 
 def test_a_pose_is_checked_by_the_depth_of_keyframes():
     first, second, aside = *steps(2, (0.03, 0.05, 0, 0.05, 0, 0.04)), steps(2, (0, 2.0, 0, 0, 0, 0))[1]
-    frames = [in_room(0, first), in_room(1, second), in_room(2, aside)]
+    frames = [in_room(0, first), in_room(1, second), in_room(2, aside), in_room(3, second)]
     frames[1].depth[::3] = torch.nan
     tracker, scene = tracker_of(frames, first)
     tracker.trajectory.know(0, first, 0)
     tracker.add_keyframe(frames[0])
-    assert tracker.agrees(frames[1], second, scene) and tracker.common > 0.7
+    assert tracker.agrees(frames[1], second, scene, 0) and tracker.overlap > 0.7
     wrong = torch.cat([second[:, :3], second[:, 3:] + 0.15], 1)
-    assert not tracker.agrees(frames[1], wrong, scene)
-    assert tracker.agrees(frames[2], aside, scene) and tracker.common < 0.3  # nothing in common is no fault
+    assert not tracker.agrees(frames[1], wrong, scene, 0)
+    assert tracker.agrees(frames[2], aside, scene, 0) and tracker.overlap < 0.3  # nothing in common is no fault
+    tracker.trajectory.know(1, wrong, 0)  # a drift that the last frame shares
+    assert not tracker.agrees(replace(frames[1], index=3), wrong, scene, 1)
 
 
 def test_features_find_a_fast_camera_that_the_map_does_not():
