@@ -252,7 +252,7 @@ def test_features_find_a_fast_camera_that_the_map_does_not():
 
 
 @pytest.mark.parametrize("metres", [0.01, 0.07])
-def test_fast_motion_is_said_after_ten_frames(metres):
+def test_fast_motion_is_said_once(metres):
     poses = steps(12, (0.0, 0.0, 0.0, metres, 0.0, 0.0))
     tracker, _ = tracker_of([], poses[0])
     tracker.trajectory = Trajectory(12)

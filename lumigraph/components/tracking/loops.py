@@ -50,13 +50,12 @@ class KeyframePlace:
     @torch.no_grad()
     def of(frame: DepthFrame) -> KeyframePlace:
         width, height = frame.size
-        picture = frame.rgb.view(height, width, 3)
-        seen = features(Photograph(frame.camera, picture))
-        depth = frame.depth.view(height, width)
-        near = torch.where(frame.measured.view(height, width), -depth, -torch.inf)[None]
-        near = -max_pool2d(near, 2 * HOLE + 1, 1, HOLE)[0]  # beside a hole the nearest surface is taken
-        depth = torch.where(depth.isfinite() | near.isinf(), depth, near)
-        places, inside = frame.camera.locate(seen.bearings)
+        camera, picture = frame.camera.to("cpu"), frame.rgb.view(height, width, 3).cpu()
+        seen = features(Photograph(camera, picture))
+        depth, known = (x.view(height, width).cpu() for x in (frame.depth, frame.measured))
+        near = -max_pool2d(torch.where(known, -depth, -torch.inf)[None], 2 * HOLE + 1, 1, HOLE)[0]
+        depth = torch.where(known, depth, torch.where(near.isfinite(), near, torch.nan))  # the nearest beside a hole
+        places, inside = camera.locate(seen.bearings)
         along = torch.where(inside, depth[places[:, 0], places[:, 1]], torch.nan)
         small = adaptive_avg_pool2d(picture.mean(-1)[None, None], THUMBNAIL).flatten()
         return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))

@@ -68,6 +68,7 @@ class Tracker(Part):
         self.register_buffer("is_keyframe", torch.zeros(image_count, dtype=torch.bool))
         self.overlap = 1.0  # share of the latest frame's points on the depth of a late keyframe
         self._latest: DepthFrame | None = None
+        self._warned = False
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
@@ -156,7 +157,7 @@ class Tracker(Part):
                 trajectory.know(frame.index, pose, anchor)
                 self._latest = frame
                 self.places.keep([*self.keyframes, frame.index])
-                self.warn_of_speed(known)
+                self.warn_of_speed([*known, frame.index])
                 return share
         trajectory.lose(frame.index, last)
         return None
@@ -204,18 +205,19 @@ class Tracker(Part):
         return steady and (most < MIN_COMMON or (on > MIN_ON_KEYFRAME * most and on > MIN_AGREEMENT * (on + front)))
 
     def warn_of_speed(self, known: list[int]) -> None:
-        """Warn once, of the first frames' motion beyond the range of tracking."""
-        if len(known) != JUDGED_FRAMES:
+        """Warn once, of motion beyond the range of tracking in ten frames."""
+        shift, turn = self.trajectory.speed(known[-JUDGED_FRAMES:])
+        fast = shift > MAX_MOTION[0] * self.unit or turn > MAX_MOTION[1]
+        if self._warned or len(known) < JUDGED_FRAMES or not fast:
             return
-        shift, turn = self.trajectory.speed(known)
-        if shift > MAX_MOTION[0] * self.unit or turn > MAX_MOTION[1]:
-            warnings.warn(
-                f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame "
-                f"(median of the first {len(known)}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
-                f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
-                LumigraphWarning,
-                stacklevel=2,
-            )
+        self._warned = True
+        warnings.warn(
+            f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame (median "
+            f"of {JUDGED_FRAMES}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
+            f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
+            LumigraphWarning,
+            stacklevel=2,
+        )
 
     def plausible(self, last: Pose, pose: Pose, frames: int) -> bool:
         """True for a motion plausible for a hand-held camera within so many frames."""
