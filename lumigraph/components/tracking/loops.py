@@ -61,7 +61,7 @@ class KeyframePlace:
         return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
 
 
-class Places:
+class FramePlaces:
     """Features of frames, found once and kept for keyframes and the latest frame."""
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class Loops(Part):
         self.unit = unit
         self.register_buffer("pairs", torch.zeros(0, 2, dtype=torch.int64))
         self.register_buffer("motions", torch.zeros(0, 3, 4))
-        self.places = Places()
+        self.places = FramePlaces()
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
         """Search the place of a new keyframe among older ones; True if found."""

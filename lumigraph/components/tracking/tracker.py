@@ -18,7 +18,7 @@ from ...files.ranges import Share, between
 from ...method import Part
 from .alignment import sensor_deviation
 from .frames import DepthFrame, Moment, order_of
-from .loops import TOLERANCE, Loops, Places, motion_between, moved
+from .loops import TOLERANCE, FramePlaces, Loops, motion_between, moved
 from .trajectory import KNOWN, Pose, Trajectory, angle, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
@@ -61,7 +61,7 @@ class Tracker(Part):
         super().__init__()
         self.numbers, self.unit, self.side = numbers, unit, side
         self.trajectory = Trajectory(image_count)
-        self.loops, self.places = Loops(unit) if numbers.track and numbers.close_loops else None, Places()
+        self.loops, self.places = Loops(unit) if numbers.track and numbers.close_loops else None, FramePlaces()
         if self.loops is not None:
             self.loops.places = self.places
         self.register_buffer("turn", torch.tensor(0))
@@ -212,8 +212,8 @@ class Tracker(Part):
             return
         self._warned = True
         warnings.warn(
-            f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame (median "
-            f"of {JUDGED_FRAMES}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
+            f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame "
+            f"(median of {JUDGED_FRAMES}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
             f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
             LumigraphWarning,
             stacklevel=2,
