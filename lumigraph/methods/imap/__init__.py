@@ -36,7 +36,7 @@ MIN_LOSS = 1e-3  # added to losses, so that each region and keyframe can be draw
 SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is explained
 SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
-MIN_OVERLAP = 0.6  # share of pixels in common with a keyframe, below which a frame becomes one, for matched features
+MIN_OVERLAP = 0.5  # share of points on a keyframe's depth, below which a frame becomes one: features match less
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
 TRACKING_RATE = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 TRACKING_PIXELS = 200  # pixels of each of these descents, section 3.4
@@ -176,7 +176,7 @@ class IMap(FieldMethod):
                 self.figures["explained"] = share
             if learns and (
                 not self.tracker.keyframes
-                or self.tracker.common < MIN_OVERLAP
+                or self.tracker.overlap < MIN_OVERLAP
                 or self.explained(self.snapshot, frame, self.tracker.trajectory.poses[frame.index], chance)
                 < c.keyframe_share
             ):
