@@ -14,6 +14,7 @@ from lumigraph.methods.deep_appearance import (
     DeepAppearance,
     grid_faces,
     sampled,
+    texel_places,
     textured,
     tracked_meshes,
     unwrapped,
@@ -30,8 +31,8 @@ def sphere(rows: int, columns: int, radius: float = 0.6) -> torch.Tensor:
 
 def test_a_photograph_is_unwrapped():
     """The ball's colour is where its surface points, so the texture is known."""
-    grid, (faces, _) = sphere(49, 65), grid_faces(49, 65)
-    rgb, shown = unwrapped(tiny.scene().photograph(1), grid, faces, 64)
+    vertices, (faces, uv) = sphere(49, 65).view(-1, 3), grid_faces(49, 65)
+    rgb, shown = unwrapped(tiny.scene().photograph(1), vertices, faces, *texel_places(vertices, faces, uv, 64))
     centre = (torch.arange(64) + 0.5) / 64
     place = sphere(49, 65).movedim(-1, 0)[None]
     v, u = torch.meshgrid(centre, centre, indexing="ij")
@@ -41,13 +42,13 @@ def test_a_photograph_is_unwrapped():
 
 
 def test_unwrapping_and_rendering_are_inverse():
-    grid, (faces, uv) = sphere(49, 65), grid_faces(49, 65)
+    vertices, (faces, uv) = sphere(49, 65).view(-1, 3), grid_faces(49, 65)
     photograph = tiny.scene().photograph(1)
-    rgb, shown = unwrapped(photograph, grid, faces, 128)
+    rgb, shown = unwrapped(photograph, vertices, faces, *texel_places(vertices, faces, uv, 128))
     from lumigraph import kernels
 
     beside = kernels.neighbours(faces)
-    seen = textured(grid.view(-1, 3), rgb.float() / 255, faces, beside, uv, photograph.camera, torch.ones(1, 3))
+    seen = textured(vertices, rgb.float() / 255, faces, beside, uv, photograph.camera, torch.ones(1, 3))
     inner = tiny.ball(photograph.camera.pose[0])[0] < 2.6
     assert float((seen.rgb - photograph.rgb)[inner].abs().mean()) < 0.02
     assert float((seen.depth - tiny.ball(photograph.camera.pose[0])[0])[inner].abs().max()) < 0.02
