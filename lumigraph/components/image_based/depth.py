@@ -29,11 +29,13 @@ from ...depth_maps.flat_view import GREY, flat_view
 from ...depth_maps.multi_view import multi_view_depth
 from ...errors import LumigraphError, LumigraphWarning
 from ...files.reading import reading
+from ...geometry import evenly
 from ..fields.level_set import level_set
 from ..sampling.occupancy import visual_hull
 
 Geometry = Literal["stereo", "measured", "hull", "mesh", "plane"]
 HULL_CELLS = 64  # of a visual hull, along each side of the box
+HULL_VIEWS, HULL_SEEN = 40, 0.5  # photographs that are asked, and share of them inside whose borders a cell must be
 HULL_REACH, HULL_BLUR = 4.0, 1.0  # cells that distances from its surface reach, and deviation of their smoothing
 FILL_SIDE = 100  # pixels along the longer side of the grid on which gaps are first filled
 SWEEPS = 40  # of relaxation at the full size
@@ -169,6 +171,9 @@ def hull_surface(scene: Scene, cells: int = HULL_CELLS) -> Mesh | None:
     centres = (np.arange(cells) + 0.5) * 2 / cells - 1
     for axis, (low, high) in enumerate(zip(*scene.frame.bounds, strict=True)):
         solid[(slice(None),) * axis + ((centres < low) | (centres > high),)] = False
+    places = torch.from_numpy(2 / cells * (np.argwhere(solid) + 0.5) - 1).float()
+    views = [scene.cameras[int(i)].locate(places)[1].float() for i in evenly(scene.splits["train"].tolist(), HULL_VIEWS)]
+    solid[solid] = (sum(views) >= HULL_SEEN * len(views)).numpy()  # a place outside the pictures is in no silhouette
     if not scene.frame.has_alpha or scene.frame.times is not None or not solid.any():
         return None
     away = (distance_transform_edt(solid) - distance_transform_edt(~solid)).clip(-HULL_REACH, HULL_REACH)
