@@ -51,7 +51,7 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
              `read_shapes`; `guidance` of `Words.read`
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
-    kind, path = kind_of(source, wanted), expanded(source)
+    kind, path = kind_of(source, wanted), folder_of(expanded(source))
     if kind is Collection:
         many = sources_of(source)
         return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
@@ -81,7 +81,7 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     scene itself, or where one is wanted; so is a procedural category of objects. Everything else is left to the readers
     of photographs. Raises LumigraphError for a path that does not exist.
     """
-    path = expanded(source)
+    path = folder_of(expanded(source))
     if str(source).startswith(WORDS):
         return Words
     if (request := requested(source)) is not None:
@@ -99,6 +99,12 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     if meshes.recognises(path) or (wanted is Shapes and any(map(meshes.is_mesh, path.rglob("*")))):
         return Shapes
     return Collection if len(members_of(path)) > 1 else Scene
+
+
+def folder_of(path: Path) -> Path:
+    """Folder of a capture for one of the files by which a reader recognises it; any other path unchanged."""
+    named = any(path.name in reader.EXPECTED_FILES for reader in READERS.values())
+    return path.parent if named and path.is_file() and not meshes.is_mesh(path) else path
 
 
 def sources_of(collection: str | Path) -> dict[str, str]:
@@ -160,7 +166,7 @@ def open_scene(
     """
     if requested(source) is not None:
         capture = read_capture(source)
-    elif single_image.recognises(path := expanded(source)):
+    elif single_image.recognises(path := folder_of(expanded(source))):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
         capture = read_capture(source, reader)
@@ -186,7 +192,7 @@ def confirm(source: str | Path) -> None:
         return
     if str(source).startswith(WORDS):
         return
-    path = expanded(source)
+    path = folder_of(expanded(source))
     if path.is_dir() and not list_images(path) and not members_of(path):
         choose_reader(path)
 
@@ -196,7 +202,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     """Photographs with poses as a reader finds them, without pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:
         return synthetic.read(request)
-    path = expanded(source)
+    path = folder_of(expanded(source))
     chosen = minecraft if path.is_file() and minecraft.recognises(path) else choose_reader(path, reader)
     if chosen is minecraft:  # whose pictures are traced
         labels, notes = minecraft.read(path)

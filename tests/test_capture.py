@@ -730,7 +730,7 @@ def test_malformed_json(tiny, tmp_path):
         (lambda m: "no matrix", ("transform_matrix",)),
         (lambda m: m[:2], ("transform_matrix",)),
         (lambda m: [["a"] * 4] * 4, ("transform_matrix",)),
-        (lambda m: [[2 * x for x in row] for row in m], ("not rigid",)),
+        (lambda m: (np.array(m) @ np.diag([2, 1, 1, 1])).tolist(), ("not rigid",)),
         (lambda m: (np.array(m) @ np.diag([-1, 1, 1, 1])).tolist(), ("mirrored",)),
         (lambda m: np.zeros((4, 4)).tolist(), ("not rigid",)),
     ],
@@ -792,8 +792,8 @@ def test_colmap_images_that_are_elsewhere(tiny, tmp_path):
 
 
 def test_colmap_lenses_nobody_follows(tiny, tmp_path):
-    camera = pycolmap.Camera(model="FOV", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 0.1])
-    refuse(write_colmap(tmp_path, tiny, cameras=[camera]), "FOV", "image_undistorter")
+    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 0.5, 1.0])
+    refuse(write_colmap(tmp_path, tiny, cameras=[camera]), "EUCM", "image_undistorter")
 
 
 def test_damaged_llff(tiny, tmp_path):

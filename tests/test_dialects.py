@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 from budgets import budget
-from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
+from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_nerfstudio, write_ngp
+from PIL import Image
 
 from lumigraph.camera.lens import Pinhole
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -23,9 +24,14 @@ from lumigraph.exchange.fourdgs import write_moving
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.large import open_any
-from lumigraph.readers import choose_reader, colmap, phones, transforms
+from lumigraph.opening import read_capture
+from lumigraph.readers import choose_reader, colmap, light_field, phones, transforms
+from lumigraph.readers.capture import checked_pose
 from lumigraph.readers.finding import find_named, paired
 from lumigraph.readers.meshes import read_mesh
+from lumigraph.readers.numbers import kind_of, read_numbers
+from lumigraph.readers.pictures import find_file, read_image
+from lumigraph.sfm.photos.gather import gather, is_bare, left_out_films, lone_film, walk
 from lumigraph.system.cache import cache_folder, temporary_cache
 
 pytestmark = budget("capture", 12)
@@ -130,7 +136,131 @@ def test_what_is_not_found_is_named_with_the_place(tiny, tmp_path):
         colmap.read(tmp_path)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_models_without_points_and_with_a_cloud_beside(tiny, tmp_path, text):
+    place = write_colmap(tmp_path, tiny, text=text) / "sparse" / "0"
+    (place / f"points3D.{'txt' if text else 'bin'}").unlink()
+    found = colmap.read(tmp_path)
+    assert len(found.shots) == 6 and found.points is None
+    shutil.copyfile(write_nerfstudio(tmp_path / "other", tiny) / "sparse.ply", place / "points3D.ply")
+    np.testing.assert_allclose(colmap.read(tmp_path).points, tiny.points, atol=1e-6)
+
+
+@pytest.mark.parametrize(("named", "images"), [("sparse/0", "images"), ("sparse", "images"), (".", "pictures")])
+def test_a_model_finds_its_photographs_from_its_own_folder(tiny, tmp_path, named, images):
+    write_colmap(tmp_path, tiny)
+    (tmp_path / "images").rename(tmp_path / images)
+    assert len(colmap.read(tmp_path / named).shots) == 6
+
+
 # Lenses and keys of transforms.json
+
+
+def test_lost_poses_cost_their_photographs_and_a_scaled_camera_none(tiny, tmp_path):
+    path = write_ngp(tmp_path, tiny) / "transforms.json"
+    said = json.loads(path.read_text())
+    said["frames"][1]["transform_matrix"][0][3] = math.nan
+    said["frames"][2]["transform_matrix"] = None
+    for row in said["frames"][3]["transform_matrix"][:3]:
+        row[:3] = [2.5 * x for x in row[:3]]
+    path.write_text(json.dumps(said))
+    with pytest.warns(LumigraphWarning, match="2 photographs whose pose is null or NaN"):
+        shots = transforms.read(tmp_path).shots
+    assert len(shots) == 4
+    np.testing.assert_allclose(checked_pose(shots[1], "here"), tiny.poses[3][:3], atol=1e-6)
+
+
+def test_a_scene_is_named_by_its_file_too(tiny, tmp_path):
+    assert len(read_capture(write_ngp(tmp_path, tiny) / "transforms.json").shots) == 6
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("JPEG", ".tif"), ("AVIF", ".avif"), ("JPEG", ".jfif"), ("WEBP", ".jpg")])
+def test_photographs_are_known_by_their_content(tmp_path, kind, suffix):
+    Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / f"a{suffix}", format=kind)
+    found = find_file(tmp_path / "a")
+    assert found.suffix == suffix and read_image(found, True, (30, 20)).mean() == pytest.approx(90, abs=2)
+
+
+def test_depth_of_floats_keeps_its_numbers(tmp_path):
+    values = np.linspace(0.5, 7, 12, dtype="<f4").reshape(3, 4)
+    (tmp_path / "a.pfm").write_bytes(b"Pf\n4 3\n-1.0\n" + values[::-1].tobytes())
+    assert kind_of(tmp_path / "a.pfm").dtype == np.float32
+    np.testing.assert_array_equal(read_numbers(tmp_path / "a.pfm"), values)
+
+
+# Masks, depth and films beside photographs
+
+
+@pytest.mark.parametrize("name", ["view_00.png", "view_00.png.png", "view_00.jpg", "view_00_mask.png", "view_00.PNG"])
+def test_masks_of_other_names_are_used(tiny, tmp_path, name):
+    write_ngp(tmp_path, tiny)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / name).write_bytes(b"x")
+    assert read_capture(tmp_path).shots[0].mask == tmp_path / "masks" / name
+
+
+@pytest.mark.parametrize("name", ["mask/view_00.png", "images/view_00_mask.png", "images/dynamic_mask_view_00.png"])
+def test_masks_in_other_places_are_named_and_are_no_photographs(tiny, tmp_path, name):
+    write_colmap(tmp_path, tiny)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    tiny_mask = Image.new("L", (WIDTH, HEIGHT), 255)
+    tiny_mask.save(tmp_path / name)
+    assert f"{tmp_path / name.split('/view')[0]}" in read_capture(tmp_path).notes[0]
+    assert len(list(walk(tmp_path))) == 6
+
+
+def test_depth_is_no_photograph_and_films_beside_photographs_are_named(tiny, tmp_path):
+    tiny.write_images(tmp_path / "color")
+    tiny.write_images(tmp_path / "depth")
+    (tmp_path / "IMG_1.MOV").write_bytes(b"x")
+    assert {path.parent.name for path in walk(tmp_path)} == {"color"}
+    assert "1 film beside the photographs, such as IMG_1.MOV," in left_out_films([tmp_path])[0]
+    shutil.rmtree(tmp_path / "color")
+    assert lone_film([tmp_path]) == [tmp_path / "IMG_1.MOV"] and is_bare(tmp_path)
+    (tmp_path / "IMG_2.MOV").write_bytes(b"x")
+    with pytest.raises(LumigraphError, match="2 films and no photographs"):
+        lone_film([tmp_path])
+
+
+def test_frames_of_a_row_of_cameras_are_no_light_field(tiny, tmp_path):
+    picture = Image.fromarray(tiny.pictures[0])
+    for camera in range(2):
+        for frame in range(5):
+            picture.save(tmp_path / f"cam_{camera}_{frame:04}.png")
+    assert not light_field.recognises(tmp_path)
+    for frame in range(3, 5):
+        (tmp_path / f"cam_0_{frame:04}.png").unlink()
+        (tmp_path / f"cam_1_{frame:04}.png").unlink()
+    assert light_field.recognises(tmp_path) and "if it is none" in light_field.read(tmp_path).notes[0]
+
+
+# Files of other programs
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("a.ksplat", "SuperSplat"), ("a.zip", "unpack it"), ("a.fbx", "Blender"), ("a.insv", "equirectangular"),
+     ("a.r3d", "RGBD"), ("a.bag", "depth/0.png")],
+)  # fmt: skip
+def test_files_of_other_programs_are_named_with_a_way_out(tmp_path, name, words):
+    (tmp_path / name).write_bytes(b"x")
+    for look in (choose_reader, open_any, lambda path: gather([path], tmp_path / "work")):
+        with pytest.raises(LumigraphError, match=words):
+            look(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [("cameras.xml", "<document/>", "Metashape"), ("bundle.out", "# Bundle file v0.3", "Bundler"),
+     ("images/a.xmp", "xcr:Position", "RealityScan"), ("a.csv", "#name,x,y,alt", "RealityScan"),
+     ("cameras_sphere.npz", "", "NeuS"), ("reconstruction.json", "[]", "OpenSfM"),
+     ("a.csv", "price", "no camera poses")],
+)  # fmt: skip
+def test_poses_of_other_programs_are_named_with_a_way_out(tiny, tmp_path, name, text, words):
+    tiny.write_images(tmp_path / "images")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(LumigraphError, match=words):
+        choose_reader(tmp_path)
 
 
 def test_k4_without_k5_and_k6_is_the_power_of_eight(tiny, tmp_path):
@@ -226,6 +356,19 @@ def test_flat_gaussians_and_properties_that_are_not_used(tmp_path):
         "passed over: label",
     ]
     assert (found.log_scales[:, 2] < found.log_scales[:, :2].amin(1) - 4).all()
+
+
+def test_axes_without_length_are_thin_and_a_trained_folder_is_its_last_cloud(tmp_path):
+    for number in (7000, 30000):
+        write_gaussians(tmp_path / f"point_cloud/iteration_{number}/point_cloud.ply", cloud(number // 1000))
+    flat = np.full(30, -np.inf, np.float32)
+    path = tmp_path / "point_cloud/iteration_30000/point_cloud.ply"
+    with_properties(path, path.with_name("b.ply"), ("scale_1",), scale_1=flat).replace(path)
+    assert is_splat_file(tmp_path)
+    found = read_gaussians(tmp_path)
+    longest = found.log_scales.amax(-1)
+    assert len(found) == 30
+    torch.testing.assert_close(found.log_scales[:, 1], longest + math.log(0.01))
 
 
 def spacetime(tmp_path: Path) -> Path:

@@ -92,14 +92,22 @@ def test_neighbours_agree_when_their_codes_do():
 
 
 def test_codes_follow_a_cloud_that_changes():
-    cloud = two_balls()
-    method = method_of(cloud)
+    """Before codes are learnt too, where a cloud grows and is pruned after one step."""
+    method = method_of(two_balls())
+    method.cloud.optimizers()
     codes = method.identities.codes.detach().clone()
     order = torch.tensor([5, 5, 2000])
-    method.identities.follow(cloud.means[order])
-    assert torch.equal(method.identities.codes.detach(), codes[order])
-    method.identities.prune(torch.tensor([True, False, True]))
+    method.cloud.rebuild(order, order == 2000)
+    method.prune(torch.tensor([True, False, True]))
     assert torch.equal(method.identities.codes.detach(), codes[order[[0, 2]]])
+
+
+def test_codes_of_an_older_run_are_those_of_the_nearest():
+    method = method_of(two_balls())
+    codes, order = method.identities.codes.detach().clone(), torch.tensor([5, 5, 2000])
+    method.cloud.replace(method.cloud.gaussians()[order])
+    method.identities.before_raster(method.step_on(Photograph(eye(EYES[0]), torch.zeros(1, 1, 3)), 0))
+    assert torch.equal(method.identities.codes.detach(), codes[order])
 
 
 def test_an_instance_is_removed_moved_copied_and_alone(learnt):

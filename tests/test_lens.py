@@ -4,13 +4,27 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import pycolmap
 import pytest
 import torch
 
 from lumigraph.camera import Camera
-from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, Mixed, OmnidirectionalStereo, OpenCV, Pinhole, stretch
+from lumigraph.camera.lens import (
+    Division,
+    Equirectangular,
+    FieldOfView,
+    Fisheye,
+    Lens,
+    Mixed,
+    OmnidirectionalStereo,
+    OpenCV,
+    Pinhole,
+    ThinPrism,
+    stretch,
+)
+from lumigraph.readers.colmap import read_lens
 
 CAMERAS, RAYS = 64, 4096
 FOX = [0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0, 0.0, 0.0, 0.0]  # a telephone's, OpenCV's order
@@ -40,6 +54,13 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
         coefficients = uniform(generator, -1, 1, CAMERAS, 4) * torch.tensor([0.02, 0.002, 5e-4, 5e-5])
         corner = (size.norm(dim=-1) / 2 + 40) / stretch(torch.tensor(math.radians(110)), coefficients.unbind(-1))[0]
         return Fisheye(corner[:, None].repeat(1, 2), centre, coefficients), size
+    if kind == "thin prism":
+        spread = torch.tensor([0.05, 0.01, 0.004, 0.001, 5e-3, 5e-3, 5e-3, 5e-3])
+        return ThinPrism(focal, centre, spread * uniform(generator, -1, 1, CAMERAS, 8)), size
+    if kind == "field of view":
+        return FieldOfView(focal, centre, uniform(generator, 0, 1.2, CAMERAS, 1)), size
+    if kind == "division":
+        return Division(focal, centre, uniform(generator, -0.3, 0.2, CAMERAS, 1)), size
     if kind == "equirectangular":
         return Equirectangular(size), size
     if kind == "part of a sphere":
@@ -49,7 +70,7 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
 
 
 SPHERES = ["equirectangular", "part of a sphere", "stereo"]
-KINDS = ["pinhole", "opencv", "fox", "fisheye", "wide fisheye", *SPHERES]
+KINDS = ["pinhole", "opencv", "fox", "fisheye", "wide fisheye", "thin prism", "field of view", "division", *SPHERES]
 
 
 def random_pixels(size, generator):
@@ -144,6 +165,32 @@ def test_colmap_means_the_same(kind, model, generator):
         theirs = pycolmap.Camera(model=model, width=width, height=height, params=parameters)
         expected = torch.from_numpy(theirs.img_from_cam(points.double().numpy()))
         torch.testing.assert_close(lens[i].project(points)[0].double(), expected, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("THIN_PRISM_FISHEYE", [310, 300, 322, 241, 0.05, -0.02, 0.003, -0.002, 0.01, 0.001, 0.004, -0.003]),
+        ("FOV", [310, 300, 322, 241, 0.9]),
+        ("FOV", [310, 300, 322, 241, 0.0]),
+        ("DIVISION", [310, 300, 322, 241, -0.2]),
+        ("DIVISION", [310, 300, 322, 241, 0.1]),
+        ("SIMPLE_DIVISION", [300, 322, 241, -0.3]),
+    ],
+)
+def test_rare_lenses_of_colmap(model, parameters, generator):
+    """Read from COLMAP's cameras, they put points on the same pixels, and pixels on the same rays."""
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=parameters)
+    lens = read_lens(theirs, Path())
+    points = torch.randn(500, 3, generator=generator) * torch.tensor([0.7, 0.6, 0.1]) + torch.tensor([0.0, 0.0, 1.0])
+    found, valid = lens.project(points)
+    expected = torch.from_numpy(theirs.img_from_cam(points.double().numpy()))
+    inside = ((expected > 0) & (expected < torch.tensor([640, 480]))).all(1)
+    assert valid[inside].all() and inside.sum() > 100
+    torch.testing.assert_close(found[inside].double(), expected[inside], atol=1e-3, rtol=0)
+    rays = lens.unproject(expected[inside].float())
+    back = torch.from_numpy(theirs.cam_from_img(expected[inside].numpy()))
+    torch.testing.assert_close((rays[:, :2] / rays[:, 2:]).double(), back, atol=2e-5, rtol=2e-5)
 
 
 def test_undistorted_opencv_is_a_pinhole(generator):

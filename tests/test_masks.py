@@ -19,7 +19,7 @@ from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation.views import evaluate
 from lumigraph.opening import open_scene
 from lumigraph.readers.objects import doubts, mask_object
-from lumigraph.readers.objects.segment import segment
+from lumigraph.readers.objects.segment import segment, still_evidence
 from lumigraph.readers.objects.view import ObjectView, find_table
 from lumigraph.sfm.folder import copy_masks
 from lumigraph.sfm.photos import gather
@@ -145,6 +145,23 @@ def test_an_object_before_a_wall_is_found_and_learnt_alone(tmp_path):
     assert scene.frame.has_alpha and scene.frame.reach == 1
     with pytest.raises(LumigraphError, match="is there already"):
         mask_object(folder, choose_reader(folder).read(folder))
+
+
+def test_a_background_at_rest_is_told_from_a_subject_that_turns():
+    """By pixels alone: where most photographs agree. A background that moves with the camera says nothing."""
+    cloud = photographed(tiny.poses()[0])[0]
+    pairs = [photographed(pose) for pose in tiny.poses()]
+    for still in (True, False):
+        chance = np.random.default_rng(0)
+        views = []
+        for i, (rgb, inside) in enumerate(pairs):
+            behind = cloud[::-1] if still else chance.random(rgb.shape)
+            shown = torch.from_numpy(np.where(inside[..., None], rgb, behind)).float()
+            views.append(ObjectView.of(f"{i}", tiny.scene().cameras[i].resized(SIDE / tiny.SIZE), shown))
+        beyond = [view.mean((~inside).astype(float)) > 0.99 for view, (_, inside) in zip(views, pairs, strict=True)]
+        evidence = np.concatenate([x[b] for x, b in zip(still_evidence(views), beyond, strict=True)])
+        assert np.median(evidence) > 2 if still else np.abs(evidence).max() < 0.5
+    assert not np.concatenate(still_evidence(views[:4])).any()
 
 
 def test_noise_holds_no_object():

@@ -24,6 +24,7 @@ from . import loops
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 MAX_FLAT_ANGLE = math.radians(89.0)  # from the axis, on a flat image plane: tan is still harmless in float32
+MIN_OMEGA = 1e-3  # radians, of a FieldOfView; a smaller one is no distortion
 NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
 CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
@@ -317,6 +318,102 @@ class Fisheye(Lens):
 
 
 @dataclass(frozen=True)
+class ThinPrism(Fisheye):
+    """Fisheye lens with tangential distortion and a thin prism (COLMAP's THIN_PRISM_FISHEYE; Weng 1992).
+
+    With (x, y) = theta (cos phi, sin phi), s = theta^2 and q(s) = 1 + k1 s + k2 s^2 + k3 s^3 + k4 s^4:
+
+        (x, y) -> (x, y) q(s) + (2 p1 xy + p2 (s + 2 x^2) + a s, p1 (s + 2 y^2) + 2 p2 xy + b s)
+
+    distortion: k1 k2 k3 k4 p1 p2 a b
+    """
+
+    distortion: Float[Tensor, "camera 8"]
+
+    @cached_property
+    def fold(self) -> Float[Tensor, "camera 1"]:
+        """Angle from the axis up to which the radial part is monotonic."""
+        return Fisheye(self.focal, self.centre, self.distortion[:, :4]).fold
+
+    def unproject(self, pixels, index=None):
+        target_x, target_y = ((pixels - rows(self.centre, index)) / rows(self.focal, index)).unbind(-1)
+        distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
+        x, y = within(target_x, target_y, limit)
+        for _ in range(NEWTON_STEPS):
+            (bent_x, bent_y), (xx, xy, yx, yy) = prism(x, y, distortion)
+            off_x, off_y = bent_x - target_x, bent_y - target_y
+            share = 1 / (xx * yy - xy * yx).clamp_min(1e-3)
+            step_x, step_y = share * (yy * off_x - xy * off_y), share * (xx * off_y - yx * off_x)
+            x, y = within(x - step_x, y - step_y, limit)
+            if small(step_x) and small(step_y):
+                break
+        theta = torch.hypot(x, y)
+        share = theta.sin() / theta.clamp_min(1e-12)
+        return torch.stack([x * share, y * share, theta.cos()], -1)
+
+    def project(self, points, index=None):
+        away = points[:, :2].norm(dim=-1)
+        theta = torch.atan2(away, points[:, 2])
+        x, y = (points[:, :2] * (theta / away.clamp_min(1e-12))[:, None]).unbind(-1)
+        bent, _ = prism(x, y, columns(self.distortion, index))
+        valid = (theta <= rows(self.fold, index)[:, 0]) & ((away > 0) | (points[:, 2] > 0))
+        return torch.stack(bent, -1) * rows(self.focal, index) + rows(self.centre, index), valid
+
+    solid_angle = Lens.solid_angle
+
+
+@dataclass(frozen=True)
+class FieldOfView(Lens):
+    """Fisheye lens of one parameter (Devernay and Faugeras 2001; COLMAP's FOV), on the plane z = 1:
+
+    r -> atan(2 r tan(omega / 2)) / omega
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+    omega: Float[Tensor, "camera 1"]
+
+    def unproject(self, pixels, index=None):
+        plane = (pixels - rows(self.centre, index)) / rows(self.focal, index)
+        r = plane.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return through_plane(*(plane * (self.straight(r, index) / r)).unbind(-1))
+
+    def project(self, points, index=None):
+        plane, valid = onto_plane(points)
+        r = plane.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        bent, seen = self.bent(r, index)
+        return plane * (bent / r) * rows(self.focal, index) + rows(self.centre, index), valid & seen[:, 0]
+
+    def straight(self, r: Tensor, index: Tensor | None) -> Tensor:
+        """Radius without distortion, of that on the picture in focal lengths."""
+        omega = rows(self.omega, index).clamp_min(MIN_OMEGA)
+        wide = 2 * (0.5 * omega).tan()
+        return torch.minimum(r * omega, (wide * math.tan(MAX_FLAT_ANGLE)).atan()).tan() / wide
+
+    def bent(self, r: Tensor, index: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Radius on the picture in focal lengths, of that without distortion, and a mask of those that it has."""
+        omega = rows(self.omega, index).clamp_min(MIN_OMEGA)
+        return (2 * r * (0.5 * omega).tan()).atan() / omega, r < math.tan(MAX_FLAT_ANGLE)
+
+
+@dataclass(frozen=True)
+class Division(FieldOfView):
+    """Lens whose distortion is a division (Fitzgibbon 2001; COLMAP's DIVISION), on the plane z = 1:
+
+    r of the picture -> r / (1 + k r^2) without distortion.    omega: k
+    """
+
+    def straight(self, r: Tensor, index: Tensor | None) -> Tensor:
+        k = rows(self.omega, index)
+        r = torch.minimum(r, k.clamp_min(1e-12).rsqrt())  # where it stops growing, for k > 0
+        return r / (1 + k * r * r).clamp_min(r / math.tan(MAX_FLAT_ANGLE))
+
+    def bent(self, r: Tensor, index: Tensor | None) -> tuple[Tensor, Tensor]:
+        root = 1 - 4 * rows(self.omega, index) * r * r
+        return 2 * r / (1 + root.clamp_min(0).sqrt()), (root >= 0) & (r < math.tan(MAX_FLAT_ANGLE))
+
+
+@dataclass(frozen=True)
 class Equirectangular(Lens):
     """Equirectangular panorama: longitude across, latitude down. The top looks along -y.
 
@@ -539,6 +636,19 @@ def bend(
     xx = q + x * x * slope + 2 * across + 4 * p2 * x
     yy = q + y * y * slope + 2 * across + 4 * p1 * y
     return (bent_x, bent_y), (xx, x * y * slope + 2 * down, yy)
+
+
+def prism(
+    x: Tensor, y: Tensor, distortion: Sequence[Tensor]
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Distortion of ThinPrism, and its Jacobian: (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
+    k1, k2, k3, k4, p1, p2, a, b = distortion
+    s = x * x + y * y
+    q, slope = polynomial(s, 1, k1, k2, k3, k4), 2 * polynomial(s, k1, 2 * k2, 3 * k3, 4 * k4)  # and 2 dq/ds
+    across, down = 2 * (p1 * y + p2 * x), 2 * (p1 * x + p2 * y)
+    bent = x * (q + across) + (p2 + a) * s, y * (q + across) + (p1 + b) * s
+    xx, yy = q + x * x * slope + across + (4 * p2 + 2 * a) * x, q + y * y * slope + across + (4 * p1 + 2 * b) * y
+    return bent, (xx, x * y * slope + down + 2 * a * y, x * y * slope + down + 2 * b * x, yy)
 
 
 def stretch(theta: Tensor, distortion: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ class Info:
         from ..datasets.scene import Scene
         from ..exchange import is_moving, is_splat_file, read_gaussians, read_moving, snerg
         from ..large import BlockRun
-        from ..opening import open_dataset, read_capture
+        from ..opening import folder_of, open_dataset, read_capture
         from ..run import is_block_run
         from ..sfm.doctor import findings
         from . import info_tree
@@ -44,7 +44,7 @@ class Info:
             tree = info_tree.moving_tree(self.what, read_moving(self.what))
         elif is_splat_file(self.what):
             tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
-        elif self.what.lower().endswith(".json") and Path(self.what).is_file():
+        elif self.what.lower().endswith(".json") and folder_of(Path(self.what)).is_file():
             from ..large import open_any
             from ..run.composition import Canonicalised
 

@@ -31,6 +31,7 @@ from ..opening import read_capture
 from ..run import Run
 from ..sfm.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
 from ..system.progress import track
+from .baseline import Baselines
 
 PIXEL_BUDGET = 800_000  # rendered pixels of all photographs together, so that the check takes seconds
 MAX_SECONDS = 10.0  # of rendering; slow methods render smaller, and fewer photographs
@@ -126,6 +127,7 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
         chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
     found: list[Compared] = []
     maps: list[DepthMap] = []
+    stand_ins = Baselines(scene, method.evidence_views)
     for index in track(chosen, "Examining photographs", len(chosen)):
         with turn():
             shot, camera, seen = rendered(method, scene, index, side)
@@ -136,7 +138,9 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
         maps.append(DepthMap.of_rendering(camera, seen, scene.frame.background))
         rgb = seen.rgb.clamp(0, 1)
         straight, mirrored = (fit(rgb[m], image[m]) for image, m in ((truth, mask), (truth.flip(1), mask.flip(1))))
-        residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0)
+        trivial = {} if splits[index] == "train" else stand_ins.of(index, tuple(truth.shape[:2]))
+        others = {name: fit(picture[mask], truth[mask]) for name, picture in trivial.items()}
+        residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0, others)
         found.append(Compared(residual, index, side))
     shares = floating(maps)
     return [

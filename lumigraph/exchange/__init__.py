@@ -14,6 +14,7 @@ import torch
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_bytes, write_json
 from ..files.marks import is_ours
+from ..files.names import natural
 from ..files.partials import remove
 from ..files.ply import read_header
 from ..files.reading import reading, reads
@@ -38,6 +39,7 @@ READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb
 SUFFIXES = tuple(name for name in WRITERS if name not in usd.SUFFIXES)  # that are read as well
 PLACED = (".glb", *usd.SUFFIXES)  # formats with a place of their own for an offset
 FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
+TRAINED = "point_cloud/iteration_*/point_cloud.ply"
 OFFSET = "offset.json"  # beside a file, or in a folder
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
@@ -175,7 +177,10 @@ def names_splats(path: Path | str) -> bool:
 
 
 def place_of(path: Path) -> Path:
-    """Folder of SOG for a path to its meta.json or lod-meta.json; any other path unchanged."""
+    """Folder of SOG for a path to its meta.json or lod-meta.json; the last cloud in the output folder of 3D Gaussian
+    splatting's own program; any other path unchanged."""
+    if path.is_dir() and (made := sorted(path.glob(TRAINED), key=lambda one: natural(one.parent.name))):
+        return made[-1]
     layout = FOLDERS.get(path.name)
     return path.parent if layout and (layout.recognises(path.parent) or not exists(path)) else path
 

@@ -4,6 +4,7 @@ reads files of a folder or a .zip within these limits."""
 from __future__ import annotations
 
 import io
+import math
 import warnings
 import zipfile
 from dataclasses import replace
@@ -21,6 +22,7 @@ from ..system.memory import free_memory
 
 NO_ROTATION = "no rotation"
 DISPLAY_NAMES = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
+FLATNESS = 0.01  # thickness of flat Gaussians, of a longer axis
 MAX_LOGIT = 20.0  # a logit whose sigmoid is 1 in float32
 BYTES_PER_NUMBER = 28  # bytes of memory for each number of a Gaussian while its file is read
 MAX_RATIO, SMALL_BYTES = 100, 1 << 26  # largest compression of a cloud; unpacked bytes below which it is not checked
@@ -59,6 +61,17 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
     return replace(finite_logits(gaussians), quaternions=quaternions)
 
 
+def with_thin_axes(gaussians: Gaussians) -> Gaussians:
+    """Axes of length zero, whose logarithm is infinite, with FLATNESS of the longest one's length."""
+    longest = gaussians.log_scales.amax(-1, keepdim=True)
+    flat = (gaussians.log_scales == -torch.inf) & longest.isfinite()
+    return (
+        replace(gaussians, log_scales=torch.where(flat, longest + math.log(FLATNESS), gaussians.log_scales))
+        if flat.any()
+        else gaussians
+    )
+
+
 def finite_logits(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT))
 
@@ -69,6 +82,7 @@ def without_unsound(gaussians: Gaussians, path: Path) -> tuple[Gaussians, Bool[T
     Raises LumigraphError where none is left.
     """
     check_harmonics(gaussians, str(path))
+    gaussians = with_thin_axes(gaussians)
     faults = find_faults(gaussians)
     good = ~torch.stack(list(faults.values())).any(0)
     if not good.all():

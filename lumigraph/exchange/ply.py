@@ -18,7 +18,7 @@ from jaxtyping import Float
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.ply import Header, columns, read_header, read_rows, write_rows
 from ..gaussians import Gaussians
-from .checks import check_room
+from .checks import FLATNESS, check_room
 from .codes import array, cloud
 
 # Comments of Postshot and of Brush that opacities are for the filter of Mip-Splatting. Both are written, either is
@@ -37,7 +37,7 @@ NORMAL = ["nx", "ny", "nz"]
 COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]
 OPACITY = ["opacity"]
 SCALE = ["scale_0", "scale_1", "scale_2"]
-FLAT, FLATNESS = "scale_2", 0.01  # the axis that 2DGS (Huang 2024) has none of; its share of the smaller other one
+FLAT = "scale_2"  # the axis that 2DGS (Huang 2024) has none of
 FILTER = "filter_3D"  # of Mip-Splatting
 MOTION = re.compile(r"trbf_(center|scale)|motion_\d+|omega_\d+")  # of Spacetime Gaussians
 KNOWN_ELEMENTS = ("face", "chunk", "sh")

@@ -7,6 +7,7 @@ from pathlib import Path
 from ..errors import LumigraphError
 from ..exchange import is_moving, is_splat_file, place_of, snerg
 from ..files import is_file, read_json
+from ..files.foreign import about_file
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
 from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
@@ -33,7 +34,9 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
             return Canonicalised(path)
         return Composition(path, open_any, within)
     if is_file(path):
-        raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
+        raise LumigraphError(
+            about_file(path) or f"{path} is none of the files that open: a splat file, or a composition's JSON"
+        )
     return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
 
 

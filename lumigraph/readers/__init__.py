@@ -11,6 +11,7 @@ from types import ModuleType
 
 from ..errors import LumigraphError
 from ..files import exists
+from ..files.foreign import about_file, about_poses
 from ..files.readers import LISTED, NAMES
 from ..files.reading import reads
 from .assemble import Before as Before
@@ -37,7 +38,8 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
         raise LumigraphError(describe_cloud(folder))
     if not folder.is_dir():
         raise LumigraphError(
-            f"{folder} is a file; name the folder that holds the photographs and their poses, "
+            about_file(folder)
+            or f"{folder} is a file; name the folder that holds the photographs and their poses, "
             f"or find those of a video or of photographs first: lumigraph capture {folder}"
         )
     if not any(folder.iterdir()):
@@ -50,6 +52,7 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
             return reader
     pictures = len(list_images(folder))
     raise LumigraphError(
-        f"{folder} holds no camera poses ({pictures} images were found): looked for "
-        f"{'; '.join(r.EXPECTED_FILES for r in asked.values())}; find the poses first: lumigraph capture {folder}"
+        about_poses(folder)
+        or f"{folder} holds no camera poses ({pictures} images were found); find the poses first: lumigraph capture "
+        f"{folder}. Looked for {'; '.join(r.EXPECTED_FILES for r in asked.values())}"
     )

@@ -138,13 +138,15 @@ class Capture:
 def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
     """The pose with an exact rotation. Raises LumigraphError for a pose that is not rigid."""
     axes = shot.pose[:, :3]
+    if (volume := np.linalg.det(axes)) > 0:  # a camera's own scale has no effect
+        axes = axes / np.cbrt(volume)
     if not np.isfinite(shot.pose).all():
         fault = "holds NaN or infinite numbers"
     elif np.abs(shot.pose[:, 3]).max() > MAX_COORDINATE:
         fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {MAX_COORDINATE:g} are the most"
     elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID_TOLERANCE:
         fault = "is not rigid, for its axes are not of unit length and at right angles"
-    elif np.linalg.det(axes) < 0:
+    elif volume < 0:
         fault = "is mirrored"
     else:
         u, _, vt = np.linalg.svd(axes)

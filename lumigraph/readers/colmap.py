@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..camera.lens import Division, Equirectangular, FieldOfView, Fisheye, Lens, OpenCV, Pinhole, ThinPrism
 from ..errors import LumigraphError
 from ..files import exists, explained, is_file, read_bytes, read_text
 from ..files.names import counted, natural
@@ -21,16 +21,19 @@ from ..system.memory import free_memory
 from .capture import Capture, Shot
 from .finding import find_named
 from .pictures import reductions, versions
-from .points import SparsePoints, read_points3d
+from .points import SparsePoints, read_ply, read_points3d
 
 BASES = (".", "colmap", "dense", "dense/0", "undistorted")  # folders in which programs leave sparse/ or sparse/0
-PARTS = ("cameras", "images", "points3D")
+PARTS = ("cameras", "images")  # of a whole model; points are in points3D of the same suffix, or in points3D.ply
 MAX_SIDE = 10**5  # pixels
 IMAGE_WORDS = 10  # of a line of images.txt; the last is the name, and may have spaces
-EXPECTED_FILES = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
+EXPECTED_FILES = "sparse/0 with cameras and images, .bin or .txt (COLMAP)"
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
 PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+ONE_BEND = {"FOV": FieldOfView, "SIMPLE_DIVISION": Division, "DIVISION": Division}
+THIN_PRISM = "THIN_PRISM_FISHEYE"
+PRISM_ORDER = [0, 1, 4, 5, 2, 3, 6, 7]  # of its k1 k2 p1 p2 k3 k4 sx1 sy1, for the lens here
 FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
@@ -55,8 +58,9 @@ def model_folders(folder: Path) -> list[Path]:
 
 
 def suffix_of(place: Path) -> str | None:
-    """Suffix of the files of a whole model; None where there is none."""
-    return next((x for x in (".bin", ".txt") if all(is_file(place / f"{part}{x}") for part in PARTS)), None)
+    """Suffix of the files of a whole model, rather one with points; None where there is none."""
+    found = [x for x in (".bin", ".txt") if all(is_file(place / f"{part}{x}") for part in PARTS)]
+    return max(found, key=lambda x: is_file(place / f"points3D{x}"), default=None)
 
 
 def image_count(place: Path) -> int:
@@ -77,14 +81,16 @@ def image_lines(lines: Sequence[str]) -> Iterator[int]:
         number += 1
 
 
-def image_folders(folder: Path, place: Path) -> dict[int, Path]:
-    """Folders of the photographs of a model, by how many times they are reduced."""
+def image_folders(folder: Path, place: Path, names: Sequence[str]) -> dict[int, Path]:
+    """Folders of the photographs of a model, by how many times they are reduced: `images` or `input` beside it or up to
+    two folders above, else the one folder of the scene that has the first name."""
     above = [one for one in (folder, *place.parents) if one == folder or folder in one.parents]
-    for base in (*above, folder.parent):
+    for base in (*above, folder.parent, folder.parent.parent):
         for name in ("images", "input"):
             if found := reductions(base / name):
                 return found
-    return {1: folder}
+    holding = [one for one in folder.iterdir() if names and is_file(one / names[0])]
+    return {1: holding[0] if len(holding) == 1 else folder}
 
 
 def read(folder: Path) -> Capture:
@@ -94,7 +100,7 @@ def read(folder: Path) -> Capture:
     model = read_model(place)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: natural(image.name))
     names = [image.name for image in images]
-    folders = image_folders(folder, place)
+    folders = image_folders(folder, place, names)
     shots, missing = [], []
     lenses = {k: (read_lens(camera, place), (camera.width, camera.height)) for k, camera in model.cameras.items()}
     for image, files in zip(images, versions(folders, names), strict=True):
@@ -112,7 +118,9 @@ def read(folder: Path) -> Capture:
             f"{names[0]} and its end there and in {folder}; put the photographs into {folder / 'images'}"
         )
     notes = [about_models(place, others)] if others else []
-    return Capture(str(folder), shots, missing=missing, notes=notes, **vars(read_points(place, model)))
+    points = read_points(place, model)
+    cloud = vars(points) if len(points.points) else {}
+    return Capture(str(folder), shots, missing=missing, notes=notes, **cloud)
 
 
 def about_models(place: Path, others: Sequence[Path]) -> str:
@@ -127,13 +135,13 @@ def about_models(place: Path, others: Sequence[Path]) -> str:
 @reads("holds no readable COLMAP model", "make or copy it again")
 def read_model(place: Path) -> pycolmap.Reconstruction:
     """Read a model with pycolmap. Raises LumigraphError for an incomplete or damaged one."""
-    if (place / "images.bin").is_file():
+    binary = suffix_of(place) == ".bin"
+    if binary:
         check_whole(place)
-        read_points3d(place / "points3D.bin")
     else:
         check_text(place / "images.txt")
-    model = pycolmap.Reconstruction(place) if suffix_of(place) == ".bin" else read_text_model(place)
-    if (place / "cameras.bin").is_file():
+    model = read_binary_model(place) if binary else read_text_model(place)
+    if binary:
         wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
         if (place / "cameras.bin").stat().st_size < wanted:
             raise ValueError("cameras.bin ends early")
@@ -205,6 +213,18 @@ def check_text(path: Path) -> None:
             check_turn([float(word) for word in words[1:5]] or [1.0], words[-1], path)
 
 
+def read_binary_model(place: Path) -> pycolmap.Reconstruction:
+    """A binary model, also one without points, as exporters leave out what they do not have."""
+    if is_file(place / "points3D.bin"):
+        read_points3d(place / "points3D.bin")
+        return pycolmap.Reconstruction(place)
+    with tempfile.TemporaryDirectory() as whole:
+        for path in place.glob("*.bin"):
+            (Path(whole) / path.name).symlink_to(path.resolve())
+        (Path(whole) / "points3D.bin").write_bytes(bytes(8))
+        return pycolmap.Reconstruction(whole)
+
+
 def read_text_model(place: Path) -> pycolmap.Reconstruction:
     """A model as text. A name is the rest of its line, spaces and all, which pycolmap ends at the first."""
     names: dict[str, str] = {}
@@ -216,6 +236,7 @@ def read_text_model(place: Path) -> pycolmap.Reconstruction:
                 names[f"{number}.png"] = name.strip()
                 lines[number] = " ".join([*numbers, f"{number}.png"])
             (Path(plain) / path.name).write_text("\n".join(lines) + "\n")
+        (Path(plain) / "points3D.txt").touch()
         model = pycolmap.Reconstruction(plain)
     for image in model.images.values():
         image.name = names[image.name]
@@ -228,8 +249,10 @@ def poses_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
 
 
 def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
-    if (place / "images.bin").is_file():
+    if suffix_of(place) == ".bin" and is_file(place / "points3D.bin"):
         return read_points3d(place / "points3D.bin")  # much quicker than asking the model for each
+    if not model.points3D and is_file(place / "points3D.ply"):
+        return read_ply(place / "points3D.ply")
     found = list(model.points3D.values())
     return SparsePoints(
         np.array([p.xyz for p in found], np.float64).reshape(-1, 3),
@@ -247,7 +270,7 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
         )
     if kind == "EQUIRECTANGULAR":
         return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
-    if kind not in PLANAR and kind not in FISHEYE:
+    if kind not in (*PLANAR, *FISHEYE, *ONE_BEND, THIN_PRISM):
         raise LumigraphError(
             f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
             f"run COLMAP's image_undistorter and use its folder"
@@ -255,6 +278,10 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     parts = camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()
     focal, centre, bends = (p[None, list(part)] for part in parts)
     focal = focal.expand(1, 2).contiguous()
+    if kind == THIN_PRISM:
+        return ThinPrism(focal, centre, bends[:, PRISM_ORDER])
+    if kind in ONE_BEND:
+        return ONE_BEND[kind](focal, centre, bends)
     if kind in FISHEYE:
         return Fisheye(focal, centre, torch.nn.functional.pad(bends, (0, 4 - bends.shape[1])))
     if not bends.any():

@@ -34,6 +34,7 @@ GANTRY = re.compile(r".*?(\d+)_(\d+)_(-?\d+\.\d+)_(-?\d+\.\d+)_?")
 GRID = re.compile(r"(?P<name>.*?)_?(\d+)[_x](\d+)")
 HCI, PARAMETERS, ABOUT = re.compile(r"input_Cam(\d+)"), "parameters.cfg", "lightfield.json"
 MIN_PICTURES = 4
+MAX_RATIO = 2  # of rows and columns of a grid by names alone; what is longer is cameras' frames in a row
 PLANE_DISTANCE = 4.0  # of the focal plane, in widths of the grid, where nothing says it
 DEPTHS = (0.5, 4.0)  # nearest and farthest, in distances of the focal plane
 
@@ -74,7 +75,8 @@ def places(folder: Path) -> dict[Path, tuple[float, float]] | None:
     if all(grid.values()) and len({match["name"] for match in grid.values() if match}) == 1:
         cells = {file: (float(match[3]), float(match[2])) for file, match in grid.items() if match}
         columns, rows = ({cell[k] for cell in cells.values()} for k in (0, 1))
-        if len(columns) > 1 and len(rows) > 1 and len(set(cells.values())) == len(columns) * len(rows):
+        short, long = sorted((len(columns), len(rows)))
+        if 1 < short and long <= MAX_RATIO * short and len(set(cells.values())) == short * long:
             return cells
     return None
 
@@ -95,7 +97,11 @@ def read(folder: Path) -> Capture:
         lens = Pinhole(torch.full((1, 2), focal), centre)
         near, far = (share * distance for share in DEPTHS)
         shots.append(Shot(file.stem, pose, lens, (width, height), {1: file}, depths=(near, far)))
-    return Capture(str(folder), shots, up=(0.0, -1.0, 0.0))
+    stated = any((folder / name).is_file() for name in (PARAMETERS, ABOUT)) or GANTRY.fullmatch(next(iter(found)).stem)
+    note = (
+        f"{folder} is read as a light field, by the names of its files alone; if it is none: lumigraph capture {folder}"
+    )
+    return Capture(str(folder), shots, up=(0.0, -1.0, 0.0), notes=[] if stated else [note])
 
 
 def lens_of(folder: Path, found: dict[Path, tuple[float, float]]) -> tuple[float, float, float]:

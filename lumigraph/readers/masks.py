@@ -7,7 +7,8 @@ alpha.
 
 labels/         class of each pixel, an integer: the layer `labels`. `lumigraph segment` writes such a folder.
 
-A mask is named after its photograph, image.png or image.jpg.png for image.jpg, and has its shape, at any size.
+A mask is named after its photograph, image.png, image.jpg.png or image_mask.png for image.jpg, and has its shape, at
+any size. Masks in other places, whose meaning differs from program to program, are named in a sentence.
 """
 
 from __future__ import annotations
@@ -18,17 +19,30 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ..errors import LumigraphWarning
-from .capture import Capture, PixelPlane
-from .pictures import list_images
+from ..files import is_file
+from .capture import Capture, PixelPlane, Shot
+from .pictures import find_file, list_images, stem
 
 MASKS, OBJECT_MASKS, LABELS = "masks", "object_masks", "labels"
+OTHER_MASKS = "mask", "matting", "segmentation"  # folders of silhouettes, or of the opposite, in other programs
+PLANES = (
+    "depth",
+    "depths",
+    "depth_maps",
+    "confidence",
+    "normals",
+    "normal",
+    "semantics",
+)  # of recordings, no photographs
 IMAGE_FOLDERS = ("images", "image", "input", "photos", "photographs", "frames")  # folders that a name may begin with
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
     """Mask of a photograph in a folder of masks, or None."""
-    names = (x for own in inner_names(name) for x in (f"{own}.png", PurePosixPath(own).with_suffix(".png")))
-    return next((folder / x for x in names if (folder / x).is_file()), None)
+    if not folder.is_dir():
+        return None
+    ends = (x for own in inner_names(name) for x in (own, stem(own), f"{stem(own)}_mask"))
+    return next((file for x in ends if is_file(file := find_file(folder / x))), None)
 
 
 def inner_names(name: str) -> Iterator[str]:
@@ -46,6 +60,12 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     mask is named after a photograph.
     """
     shots, missing = list(capture.shots), list(capture.missing)
+    if (other := other_masks(shots, folder)) is not None:
+        text = (
+            f"{other} is not used, for programs disagree on its meaning; put masks whose black pixels are ignored "
+            f"into {folder / MASKS}, silhouettes into {folder / OBJECT_MASKS}"
+        )
+        capture = replace(capture, notes=[*capture.notes, text])
     if (folder / MASKS).is_dir():
         shots = [
             shot if shot.mask is not None else replace(shot, mask=find_mask(folder / MASKS, shot.name))
@@ -64,6 +84,15 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
         warn_unmatched(folder / LABELS, any(LABELS in shot.planes for shot in found))
         shots = found
     return replace(capture, shots=shots, missing=missing)
+
+
+def other_masks(shots: list[Shot], folder: Path) -> Path | None:
+    """A folder or a file of masks in a place of another program, if no photograph has a mask."""
+    if any(shot.mask is not None or not isinstance(shot.image, dict) for shot in shots[:1]) or not shots:
+        return None
+    picture = shots[0].image[min(shots[0].image)]
+    beside = [picture.with_name(f"{name}.png") for name in (f"{picture.stem}_mask", f"dynamic_mask_{picture.stem}")]
+    return next((x for x in (*beside, *(folder / name for name in OTHER_MASKS)) if x.exists()), None)
 
 
 def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:

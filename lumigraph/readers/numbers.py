@@ -25,6 +25,7 @@ PNG_SIGNATURE, EXR_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # firs
 EXR_HALF = 1  # among the types of its channels
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
 TIFF_SUFFIXES, TIFF_FLOAT = (".tif", ".tiff"), 3  # and its sample format
+PILLOW_TYPES = {"F": np.float32, "I": np.int32, "I;16": np.uint16, "I;16B": np.uint16}  # of its modes, .pfm and .pgm
 MAX_SIDE, DECODING_COPIES = 10**5, 4  # pixels; and copies in memory while an image is decoded, turned and reduced
 ARRAY_NAMES = {"labels": ("labels", "ids", "semantics")}  # accepted names in an .npz
 
@@ -103,7 +104,7 @@ def kind_of(path: Path, name: str = "") -> Kind:
             with Image.open(path) as image:
                 linear = image.info.get("gamma") == 1.0
             return Kind((width, height), np.dtype(np.uint16), PNG_CHANNELS.get(colour, 1), linear)
-    if suffix in TIFF_SUFFIXES:
+    if is_tiff(path):
         tags = tiff_tags(path)
         bits, channels = max(tags.get(Tag.BitsPerSample, (1,))), int(tags.get(Tag.SamplesPerPixel, 1))
         size = int(tags[Tag.ImageWidth]), int(tags[Tag.ImageLength])
@@ -111,7 +112,15 @@ def kind_of(path: Path, name: str = "") -> Kind:
             return Kind(size, np.dtype(f"f{bits // 8}"), channels, True)
         return Kind(size, np.dtype(f"u{max(bits // 8, 1)}"), channels)
     with Image.open(path) as image:
-        return Kind(image.size, np.dtype(np.uint8), len(image.getbands()))
+        return Kind(image.size, np.dtype(PILLOW_TYPES.get(image.mode, np.uint8)), len(image.getbands()))
+
+
+def is_tiff(path: Path) -> bool:
+    """True for a file of TIFF's suffix that is no other kind of picture under that name."""
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return False
+    with open(path, "rb") as file:
+        return file.read(4)[:2] in (b"II", b"MM") or path.stat().st_size < 4
 
 
 def tiff_tags(path: Path) -> Mapping[int, Any]:
@@ -160,9 +169,9 @@ def read_numbers(path: Path, name: str = "") -> np.ndarray:
         return read_array(path, name)
     if path.suffix.lower() == ".exr":
         return read_exr(path).astype(exr_kind(path).dtype)
-    kind, tiff = kind_of(path), path.suffix.lower() in TIFF_SUFFIXES
-    grey_floats = tiff and kind.channels == 1 and kind.dtype.kind == "f"  # unknown to FFmpeg
-    if kind.deep and not grey_floats:
+    kind, tiff = kind_of(path), is_tiff(path)
+    of_pillow = kind.channels == 1 and kind.dtype.kind in "fi"  # unknown to FFmpeg, or of another order there
+    if kind.deep and not of_pillow:
         with open(path, "rb") as file, av.open(file, "r") as container:
             return next(container.decode(video=0)).to_ndarray().astype(kind.dtype)
     with Image.open(path) as image:

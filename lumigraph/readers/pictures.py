@@ -20,17 +20,7 @@ from ..files import is_file
 from ..files.reading import reading
 from ..system.memory import free_memory
 from .capture import PixelPlane, Shot
-from .numbers import (
-    DECODING_COPIES,
-    TIFF_SUFFIXES,
-    Kind,
-    as_bytes,
-    check_pixels,
-    kind_of,
-    read_numbers,
-    tiff_tags,
-    turned,
-)
+from .numbers import DECODING_COPIES, Kind, as_bytes, check_pixels, is_tiff, kind_of, read_numbers, tiff_tags, turned
 from .profiles import Colours, colours_of
 
 DIGEST_SAMPLES, DIGEST_BYTES = 16, 1 << 12  # steps from one sample of a file's content to the next; bytes of a sample
@@ -38,7 +28,8 @@ DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 IMAGE_SUFFIXES = (
-    ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES
+    ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES,
+    ".avif", ".jfif", ".jp2",
 )  # fmt: skip
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
@@ -238,7 +229,7 @@ def measure(path: Path) -> tuple[Size, int | None]:
     with readable(path):
         if path.suffix.lower() == ".exr":
             return kind_of(path).size, None
-        if path.suffix.lower() in TIFF_SUFFIXES:
+        if is_tiff(path):
             return kind_of(path).size, tiff_tags(path).get(EXIF_ORIENTATION)
         with Image.open(path) as image:
             check_pixels(image.size)
@@ -293,7 +284,7 @@ def read_deep(path: Path, turn: bool) -> np.ndarray:
 
 def deep_colours(path: Path) -> Colours:
     """Colour description of a file of more than eight bits."""
-    if path.suffix.lower() in TIFF_SUFFIXES:
+    if is_tiff(path):
         return Colours(profile=bytes(tiff_tags(path).get(ICC_TAG, b"")))
     if path.suffix.lower() != ".png":
         return Colours()

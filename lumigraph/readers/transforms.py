@@ -7,6 +7,8 @@ val_filenames.
 from __future__ import annotations
 
 import math
+import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,10 +17,11 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
-from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, ThinPrism
 from ..datasets.scene import GeographicOrigin
-from ..errors import LumigraphError
-from ..files import is_file, read_json
+from ..errors import LumigraphError, LumigraphWarning
+from ..files import from_json, is_file, read_bytes, read_json
+from ..files.names import counted
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from ..files.reading import reading, reads
 from . import colmap
@@ -49,9 +52,11 @@ BLENDER_EMPTY_DEPTHS = (1e10, 65504.0)  # depth that Blender writes for backgrou
 
 WITHOUT_BENDS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 WITH_BENDS = ("OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
+FISHEYES = ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
 LARGEST_RADIUS, BEYOND = 4.0, 1.05  # where a lens is fitted, at most; and times the radius of the picture's corner
 RIDGE = 1e-10  # singular values that count as none, of the largest
 
+NO_NUMBER = re.compile(rb"(?<=[\[,:\s])-?(?:NaN|Infinity)\b")  # as Python writes them, and JSON has none
 Json = dict[str, Any]
 Across = Annotated[float, between(1, 1e5)]  # pixels
 Focal = Annotated[float, between(1e-2, 1e7)]  # pixels
@@ -130,6 +135,8 @@ class Posed:
     k6: Bend | None = None
     p1: Bend | None = None
     p2: Bend | None = None
+    sx1: Bend | None = None
+    sy1: Bend | None = None
     time: Coordinate | None = None
     mask_path: Name | None = None
     depth_file_path: Name | None = None
@@ -190,8 +197,21 @@ def about_dialect(path: Path, plain: Json) -> list[str]:
 
 def read_frames_file(path: Path) -> tuple[Whole, Json]:
     """Contents of a file: parsed fields of the whole file, and raw JSON."""
-    plain = read_json(path)
+    plain = from_json(NO_NUMBER.sub(b"null", read_bytes(path)), path)
+    typed(Whole, plain, path)
+    placed = [frame for frame in plain["frames"] if not unplaced(frame.get("transform_matrix", 0))]
+    if len(placed) < len(plain["frames"]):
+        count = counted(len(plain["frames"]) - len(placed), "photograph")
+        text = f"{path} has {count} whose pose is null or NaN, as programs write one that they lost; they are left out"
+        warnings.warn(text, LumigraphWarning, stacklevel=2)
+        plain["frames"] = placed
     return typed(Whole, plain, path), plain
+
+
+def unplaced(matrix: Any) -> bool:
+    """True for no matrix, and for one with a number that is none."""
+    rows = matrix if isinstance(matrix, list) else []
+    return matrix is None or any(x is None for row in rows for x in (row if isinstance(row, list) else [row]))
 
 
 def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[Shot], list[str]]:
@@ -272,7 +292,7 @@ def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> d
 def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
     """Depth as nerfstudio stores it, thousandths of a unit by default, or as instant-ngp does."""
     stated = about.integer_depth_scale if key == "depth_path" else about.depth_unit_scale_factor
-    scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
+    scale = stated if stated is not None else 1.0 if file.suffix.lower() in (".exr", ".pfm") else 1e-3
     along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
     whole = file.suffix.lower() in (".png", ".tif", ".tiff")
     unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), BLENDER_EMPTY_DEPTHS)
@@ -302,8 +322,8 @@ def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     model = model_of(about)
     if model in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Equirectangular(row(width, height))
-    if model not in (*WITHOUT_BENDS, *WITH_BENDS, "OPENCV_FISHEYE"):
-        known = ", ".join((*WITHOUT_BENDS[:2], *WITH_BENDS, "OPENCV_FISHEYE"))
+    if model not in (*WITHOUT_BENDS, *WITH_BENDS, *FISHEYES):
+        known = ", ".join((*WITHOUT_BENDS[:2], *WITH_BENDS, *FISHEYES))
         raise LumigraphError(
             f"{where} has camera_model {model}; only {known} and EQUIRECTANGULAR are known, so undistort the "
             "photographs first"
@@ -317,6 +337,9 @@ def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     focal, centre = row(focal_x, focal_y), row(centre_x, centre_y)
     if model == "OPENCV_FISHEYE":
         return Fisheye(focal, centre, row(*(getattr(about, f"k{i}") or 0.0 for i in (1, 2, 3, 4))))
+    if model == "THIN_PRISM_FISHEYE":
+        names = ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1")
+        return ThinPrism(focal, centre, row(*(getattr(about, name) or 0.0 for name in names)))
     bends = [getattr(about, key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     if model in WITHOUT_BENDS or not any(bends):
         return Pinhole(focal, centre)

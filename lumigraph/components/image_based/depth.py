@@ -22,6 +22,7 @@ from torch.nn.functional import interpolate
 from ... import kernels
 from ...camera import Camera
 from ...camera.lens import OpenCV, Pinhole
+from ...datasets.images.resize import resized
 from ...datasets.mesh import Mesh
 from ...datasets.scene import Frame, Photograph, Scene
 from ...depth_maps import DepthMap
@@ -158,8 +159,8 @@ def resampled(seen: DepthMap, grid: Camera) -> Float[Tensor, "height width"]:
 
 def _measured(photograph: Photograph, grid: Camera) -> Float[Tensor, "height width"]:
     """A photograph's depth layer, resampled to its depth map's pixels, each by the nearest."""
-    depth = photograph.extra["depth"]
-    return interpolate(depth[None, None], shape(grid), mode="nearest-exact")[0, 0]
+    depth = photograph.extra["depth"].numpy()
+    return torch.from_numpy(resized(depth, shape(grid)[::-1], "plain", ~np.isnan(depth)))
 
 
 def hull_surface(scene: Scene, cells: int = HULL_CELLS) -> Mesh | None:

@@ -22,7 +22,7 @@ from ...datasets.scene import Frame, Scene
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
 from ...errors import LumigraphError
 from ...exchange.bones import SUFFIXES, read_motion
-from ...files.ranges import Layers, LearningRate, Share, Width
+from ...files.ranges import LearningRate, Share
 from ...geometry import multiply, to_matrix, to_quaternion
 from ...method import Part
 from ...method.controls import Control, Value, moment
@@ -42,6 +42,9 @@ MIN_POSE_ERROR, MAX_POSE_ERROR = 1.0, 10.0  # degrees; a joint below is exact, a
 MIN_DISTURBED_SHARE = 0.5  # of the joints with such errors; fewer are sudden motions of an exact body
 TRACE_STEP = 1e-3  # of the weight's logarithm
 
+POSE_WIDTH = 256  # channels of the network's layers
+POSE_DEPTH = 4  # its hidden layers
+
 
 @dataclass(frozen=True)
 class BoneNumbers:
@@ -50,8 +53,6 @@ class BoneNumbers:
     pose_correction: Literal["no", "table", "network"] = "network"  # corrections of joints: none, of each moment, a MLP
     pose_lr: LearningRate = 5e-5  # learning rate of the corrections; of a table in radians a step
     pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
-    pose_width: Width = 256  # channels of the network's layers
-    pose_depth: Layers = 4  # its hidden layers
     pose_smoothing: bool = False  # smooth given poses over time, as far as cross-validation finds; exact ones stay
 
 
@@ -96,7 +97,7 @@ class BoneMotion(Part):
         self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
         if n.pose_correction == "network":
-            widths = [self.given_angles.shape[1], *[n.pose_width] * n.pose_depth]
+            widths = [self.given_angles.shape[1], *[POSE_WIDTH] * POSE_DEPTH]
             layers = [x for a, b in zip(widths, widths[1:], strict=False) for x in (nn.Linear(a, b), nn.ReLU())]
             last = nn.Linear(widths[-1], 3 * bones)
             nn.init.uniform_(last.weight, -MIN_OUTPUT, MIN_OUTPUT)

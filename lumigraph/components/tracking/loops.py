@@ -7,6 +7,7 @@ robust loss by SciPy: COLMAP's pose graph stores pairs of views and optimises no
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -57,6 +58,30 @@ class KeyframePlace:
         return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
 
 
+class Places:
+    """Features of frames, found once and kept for keyframes and the latest frame."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, KeyframePlace] = {}
+
+    def of(self, frame: DepthFrame) -> KeyframePlace:
+        if frame.index not in self._known:
+            self._known[frame.index] = KeyframePlace.of(frame)
+        return self._known[frame.index]
+
+    def keep(self, images: Iterable[int]) -> None:
+        """Forget frames that are not among these images."""
+        self._known = {i: self._known[i] for i in images if i in self._known}
+
+    def alike(self, frame: DepthFrame, others: Sequence[DepthFrame]) -> list[DepthFrame]:
+        """At most CANDIDATES of other frames whose thumbnails look like this one's, the most similar first."""
+        if not others:
+            return []
+        likeness = torch.stack([self.of(other).thumbnail for other in others]) @ self.of(frame).thumbnail
+        order = likeness.argsort(descending=True, stable=True)[:CANDIDATES].tolist()
+        return [others[i] for i in order if likeness[i] >= MIN_LIKENESS]
+
+
 class Loops(Part):
     """Detected loops: pairs of images, the earlier one first, and the pose of the later one in its frame."""
 
@@ -69,25 +94,14 @@ class Loops(Part):
         self.unit = unit
         self.register_buffer("pairs", torch.zeros(0, 2, dtype=torch.int64))
         self.register_buffer("motions", torch.zeros(0, 3, 4))
-        self._places: dict[int, KeyframePlace] = {}
-
-    def place(self, frame: DepthFrame) -> KeyframePlace:
-        if frame.index not in self._places:
-            self._places[frame.index] = KeyframePlace.of(frame)
-        return self._places[frame.index]
+        self.places = Places()
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
         """Search the place of a new keyframe among older ones; True if found."""
-        own, others = self.place(frame), [self.place(other) for other in older[:-MIN_AGE]]
-        if not others:
-            return False
-        likeness = torch.stack([other.thumbnail @ own.thumbnail for other in others])
-        for i in likeness.argsort(descending=True, stable=True)[:CANDIDATES].tolist():
-            if likeness[i] < MIN_LIKENESS:
-                break
-            motion = motion_between(others[i], own, TOLERANCE * self.unit, chance)
+        for other in self.places.alike(frame, older[:-MIN_AGE]):
+            motion = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
             if motion is not None:
-                pair = torch.tensor([[older[i].index, frame.index]]).to(self.pairs)
+                pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
                 self.pairs = torch.cat([self.pairs, pair])
                 self.motions = torch.cat([self.motions, motion[None].to(self.motions)])
                 return True
@@ -102,6 +116,11 @@ class Loops(Part):
         steps = [motion(poses[i], poses[i + 1]) for i in neighbours.tolist()]
         motions = torch.cat([torch.stack(steps), self.motions.to(poses)])
         return optimised(poses.double(), edges, motions.double(), self.unit).to(poses)
+
+
+def moved(pose: Pose, motion: Pose) -> Pose:
+    """Pose after a motion in its own frame."""
+    return torch.cat([pose[:, :3] @ motion[:, :3], (pose[:, :3] @ motion[:, 3] + pose[:, 3])[:, None]], -1)
 
 
 def motion(first: Pose, second: Pose) -> Pose:

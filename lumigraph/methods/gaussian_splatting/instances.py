@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, log_softmax
@@ -17,6 +17,7 @@ from torch.nn.functional import cross_entropy, log_softmax
 from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.cloud import Cloud
 from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...components.training.row_optimizers import exchange
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
 from ...files.ranges import LearningRate, Share, Steps, between
@@ -49,7 +50,7 @@ class Identities(Addition):
     """Identity codes and a linear classifier. They change neither positions nor colours.
 
     codes:  of each Gaussian
-    places: positions of the Gaussians at the last `follow`, to transfer codes after densification
+    places: positions of the Gaussians when codes were last learnt
     seen:   labels in the photographs
     """
 
@@ -80,26 +81,13 @@ class Identities(Addition):
         drawn = FIRST_DEVIATION * torch.randn(len(cloud), self.numbers.identity_code, generator=chance)
         self._set(drawn.to(self.places.device), cloud.means.detach().clone())
 
-    def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
-        """Transfer codes to a cloned, split or pruned cloud: from the nearest old Gaussian."""
-        if len(means) == len(self.places) and torch.equal(means.detach(), self.places):
-            return
-        if len(means) != len(self.places):
-            nearest = cKDTree(self.places.cpu().numpy()).query(means.detach().cpu().numpy(), workers=-1)[1]
-            self._set(self.codes.data[torch.from_numpy(nearest)], means.detach().clone())
-        else:
-            self.places = means.detach().clone()
-
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        self._set(self.codes.data[keep], self.places[keep])
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
+        self._set(self.codes.data[source], self.places[source])
 
     def _set(self, codes: Tensor, places: Tensor) -> None:
         """Replace the codes, with fresh optimizer moments, for a cloud changes every hundred steps."""
-        old, self.places = self.codes, places
-        self.codes = nn.Parameter(codes.clone())
-        if self.optimizer is not None:
-            self.optimizer.state.pop(old, None)
-            self.optimizer.param_groups[0]["params"] = [self.codes]
+        self.places = places
+        exchange(self, "codes", codes, self.optimizer)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers
@@ -113,12 +101,18 @@ class Identities(Addition):
 
     # Learning
 
+    def before_raster(self, step: Step) -> None:
+        means = step.learnt.means.detach()
+        if len(means) != len(self.places):  # in a run that was saved when codes followed the cloud only while learnt
+            nearest = cKDTree(self.places.cpu().numpy()).query(means.cpu().numpy(), workers=-1)[1]
+            self.follow(torch.from_numpy(nearest).to(means.device))
+
     def regularize(self, step: Step) -> None:
         """Cross entropy of rendered identities, and the neighbours' agreement (eqs. 3 and 4)."""
         n = self.numbers
         if step.progress < n.identity_start or step.drawn % n.identity_interval:
             return
-        self.follow(step.learnt.means)
+        self.places = step.learnt.means.detach().clone()
         labels, known = labels_of(step.photograph.extra, step.photograph.alpha, n.instances)
         self.seen[labels[labels >= 0].unique()] = True
         logits = self.classifier(self.rendered(step))

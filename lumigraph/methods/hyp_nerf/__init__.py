@@ -26,7 +26,7 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at, turning
 from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
@@ -40,6 +40,9 @@ Tally = Annotated[int, between(0, 100_000)]
 
 DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in tuning
 
+HYPER_LAYERS = 2  # hidden layers of the hypernetwork for each tensor
+DENOISER_WIDTH = 32  # channels of the denoiser, section 3.3
+
 
 @dataclass(frozen=True)
 class Config:
@@ -50,7 +53,6 @@ class Config:
     colour_code: Width = 512  # numbers of the code of the colour network, section 3.2; more hold more colours
     code_deviation: Positive = 0.01  # standard deviation of codes at first; larger ones start farther apart
     hyper_width: Width = 512  # channels of the hypernetwork's hidden layers; wider costs memory and time
-    hyper_layers: Layers = 2  # hidden layers of the hypernetwork for each tensor; more cost time
     members: Count = 4096  # members of a collection at most; each has a code, so more cost memory
     hidden_width: Width = 64  # channels of an object's density and colour networks; wider costs time
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512  # samples across the diagonal; fewer are faster
@@ -64,7 +66,6 @@ class Config:
     code_weight: NonNegative = 0.0  # weight of the codes' squares in the loss; higher keeps codes near zero
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
-    denoiser_width: Width = 32  # channels of the denoiser, section 3.3; wider costs time
     denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
     # Fitting one scene.
     code_steps: Tally = 200  # steps that fit the code of a new scene, section 3.3; more take longer
@@ -142,8 +143,8 @@ class HypNeRF(RayMethod):
         self.shape = HashShape.of(c.table, c.hidden_width)
         with seeded(c.seed):
             sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
-            self.hyper = HyperNetwork(sizes, c.hyper_width, c.hyper_layers, self.shape.tensors)
-            self.denoiser = PictureDenoiser(c.denoiser_width)
+            self.hyper = HyperNetwork(sizes, c.hyper_width, HYPER_LAYERS, self.shape.tensors)
+            self.denoiser = PictureDenoiser(DENOISER_WIDTH)
         self.codes = InstanceCodes(c.members, c.shape_code + c.colour_code)
         self.found = Kept(torch.empty(0, c.shape_code + c.colour_code))  # the code of a scene that was given, or drawn
         self.tuned = untuned(self.shape)
@@ -166,12 +167,10 @@ class HypNeRF(RayMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        table = HashNumbers(
-            levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
-        )
-        return Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1,
+        table = HashNumbers(levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, sh_bands=1)
+        return Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16,
             hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64,
-            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3, denoiser_width=4,
+            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3,
             denoiser_start=0.0, denoise_views=2, denoise_steps=4, code_steps=8, tune_steps=4)  # fmt: skip
 
     @classmethod

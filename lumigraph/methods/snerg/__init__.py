@@ -32,7 +32,6 @@ from ...files.ranges import (
     Layers,
     LearningRate,
     NonNegative,
-    Octaves,
     PositiveShare,
     Seed,
     Share,
@@ -50,6 +49,9 @@ from ...volume import composite, weights_of
 from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
 
+VIEW_WIDTH = 16  # channels of the view-dependence network, section 4.2
+POSITION_FREQUENCIES = 10  # octaves of positions of the network
+
 
 @dataclass(frozen=True)
 class Config:
@@ -60,7 +62,6 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     field: Literal["hash", "network"] = "network"  # field to bake: the paper's network, or a faster hash table
-    view_width: Width = 16  # channels of the view-dependence network, section 4.2; wider is slower in a browser
     sparsity_weight: NonNegative = 1e-7  # lambda_s of eq. 8: 1e-4 over a ray's 1024 samples; higher: emptier voxels
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # share of the budget ahead of baking
     voxel_share: Share = 0.0  # share of the rest in which voxels learn too, then the small network alone; 0: none
@@ -78,7 +79,6 @@ class Config:
     hidden_layers: Layers = 8  # hidden layers of the field's network; more cost time
     hidden_width: Width = 512  # channels of the field's hidden layers, the release's; wider costs memory and time
     # Of the paper's network.
-    position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -139,8 +139,8 @@ class SNeRG(FieldMethod):
                 self.network = HashDeferred(c.table, c.hidden_layers, c.hidden_width, space, frame.reach)
             else:
                 layers = c.hidden_layers, c.hidden_width, SKIP_LAYER
-                self.network = NetworkDeferred(c.position_frequencies, *layers, space)
-            self.view = ViewDependence(c.view_width)
+                self.network = NetworkDeferred(POSITION_FREQUENCIES, *layers, space)
+            self.view = ViewDependence(VIEW_WIDTH)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         contracted = contraction_of(frame) if c.whole and frame.is_open else None
         self.voxel_space = contracted or Box(frame.bounds, frame.near)

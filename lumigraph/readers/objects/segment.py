@@ -31,6 +31,9 @@ SHADOW_BRIGHTNESS = 0.35  # of the darkest shadow
 PLAIN_SHARE, PLAIN_DISTANCE = 0.8, 3.0  # share of a plain backdrop within this CIELAB distance of its median
 BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body covers
 MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
+MAX_STILL_DEVIATION = 8.0  # CIELAB units by which photographs may differ at a pixel that shows a still background
+COLOUR_RANGE = 50.0  # CIELAB units along each axis, over which an object's colours spread
+MIN_STILL_VIEWS = 8  # photographs that a still background is found in
 MIN_CELLS = 20  # of a body
 MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
@@ -108,15 +111,15 @@ def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None
         raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
     shown = [behind(region, view) for view in views]
-    body = first_guess(region, points)
+    still, body = still_evidence(views), first_guess(region, points)
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
     inside = [share > 0.5 for share in shares]
     strength = 0.0  # at first the body is a guess, and only colours speak
     for slack in track(MAX_DISAGREEMENTS, "Cutting the object out", len(MAX_DISAGREEMENTS)):
         own, around = learn_colours(views, inside)
         inside = []
-        for view, share, may in zip(views, shares, allowed, strict=True):
-            colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours)
+        for view, share, may, unmoved in zip(views, shares, allowed, still, strict=True):
+            colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours) + unmoved
             costs = colour.clip(-MAX_COLOUR_LOG_LIKELIHOOD, MAX_COLOUR_LOG_LIKELIHOOD) - strength * (2 * share - 1)
             inside.append(cut(view, np.where(may, costs, MAX_COST)))
         body = carved(region, shown, inside, slack)
@@ -124,6 +127,22 @@ def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None
         strength = BODY_LOG_LIKELIHOOD
     overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
     return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
+
+
+def still_evidence(views: Sequence[ObjectView]) -> list[Float[np.ndarray, " patch"]]:
+    """Log-likelihood ratios of superpixels for a background at rest in the picture, behind a subject that turns, or
+    plain: ln N(colour; median of all views, their deviation) + 3 ln COLOUR_RANGE, and 0 where views differ at a pixel.
+    """
+    if len({view.lab.shape for view in views}) > 1 or len(views) < MIN_STILL_VIEWS:
+        return [np.zeros(len(view.sizes)) for view in views]
+    stack = np.stack([view.lab for view in views]).astype(np.float32)
+    middle = np.median(stack, 0)
+    away = np.linalg.norm(stack - middle, axis=-1)
+    deviation = np.maximum(np.median(away, 0), MIN_DEVIATION)
+    ratio = 3 * np.log(COLOUR_RANGE / (deviation * (2 * np.pi) ** 0.5)) - 0.5 * (away / deviation) ** 2
+    limit = MAX_COLOUR_LOG_LIKELIHOOD
+    ratio = np.where(deviation < MAX_STILL_DEVIATION, ratio.clip(-limit, limit), 0.0)
+    return [view.mean(own) for view, own in zip(views, ratio, strict=True)]
 
 
 def distinctness(views: Sequence[ObjectView], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:

@@ -25,7 +25,8 @@ from ...color.display import BT709, BT2020, HLG, HLG_PEAK, PQ, UNKNOWN, WHITE, i
 from ...errors import LumigraphError
 
 VIDEOS = {
-    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
+    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv",
+    ".ts", ".mxf", ".vob", ".m2v",
 }  # fmt: skip
 MATRICES = {
     1: Colorspace.ITU709,

@@ -16,10 +16,11 @@ from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import exists, explained
+from ...files.foreign import about_file
 from ...files.names import counted, natural
 from ...files.reading import reason_of
 from ...readers.exif import read_facts
-from ...readers.masks import MASKS, OBJECT_MASKS, find_mask
+from ...readers.masks import LABELS, MASKS, OBJECT_MASKS, OTHER_MASKS, PLANES, find_mask
 from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
@@ -29,10 +30,11 @@ from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
 from .video import extract
 
-PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
+PHOTOGRAPHS = {".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".jp2", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
 LOOKING_BYTES = 400_000_000  # of a photograph of 24 megapixels, decoded and turned
 REDUCED_FOLDER = re.compile(r"(.+)_(?!0*1?$)[0-9]+")  # images_4 beside images: the same photographs, reduced
+NO_PHOTOGRAPHS = {MASKS, OBJECT_MASKS, LABELS, *OTHER_MASKS, *PLANES}  # folders beside photographs
 PROGRAM_FILES = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # in folders of programs
 
 
@@ -45,7 +47,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     track:   progress display, as display.track
     Raises LumigraphError without any picture.
     """
-    films = [source for source in sources if is_video(source)]
+    films = [source for source in sources if is_video(source)] or lone_film(sources)
     if films and len(sources) > 1:
         raise LumigraphError(f"{films[0]} is a video among other things; name it alone, or photographs without it")
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
@@ -67,7 +69,15 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     photos = with_altitudes([one.photo for one in seen])
-    return assess(Intake(source, photos, unreadable=unreadable, raw=raw, remarks=pairs), seen)
+    remarks = pairs + left_out_films(sources)
+    return assess(Intake(source, photos, unreadable=unreadable, raw=raw, remarks=remarks), seen)
+
+
+def left_out_films(sources: Sequence[Path]) -> tuple[str, ...]:
+    """A sentence on the films beside photographs."""
+    films = films_in(sources)
+    names = f"{counted(len(films), 'film')} beside the photographs, such as {films[0].name}," if films else ""
+    return (f"{names} are left out; name a film alone to use it",) if films else ()
 
 
 def without_raw_twins(files: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
@@ -136,6 +146,8 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
     if not unreadable:
         return f"{source} holds no photographs ({', '.join(sorted(PHOTOGRAPHS))}); name the folder or the video to use"
     name, why = next(iter(unreadable.items()))
+    if len(unreadable) == 1 and (foreign := about_file(Path(name))) is not None:
+        return foreign
     return f"{source} holds no photograph that can be read ({name}: {why}); copy them again, or convert them to JPEG"
 
 
@@ -145,6 +157,8 @@ def is_bare(path: Path) -> bool:
 
     if not path.is_dir():
         return is_video(path)
+    if len(films_in([path])) == 1 and next(walk(path), None) is None:
+        return True
     if any((path / name).exists() for name in PROGRAM_FILES) or any(r.recognises(path) for r in READERS.values()):
         return False
     return next(walk(path), None) is not None
@@ -170,17 +184,45 @@ def walk(
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
+    stems = {entry.stem for entry in entries}
     for entry in entries:
         if entry.name.startswith(".") or (work is not None and entry.resolve() == work):
             continue
         if entry.name in folders:
             reduced = REDUCED_FOLDER.fullmatch(entry.name)
-            if entry.name in (MASKS, OBJECT_MASKS) or (reduced and reduced[1] in folders):
+            if entry.name.lower() in NO_PHOTOGRAPHS or (reduced and reduced[1] in folders):
                 continue
             if not entry.is_symlink() and not any(exists(entry / name) for name in PROGRAM_FILES):
                 yield from walk(entry, work, list_entries)
-        elif entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry):
+        elif (entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry)) and not is_mask(entry, stems):
             yield entry
+
+
+def is_mask(path: Path, stems: set[str]) -> bool:
+    """True for image_mask.png and dynamic_mask_image.png beside image.jpg."""
+    stem = path.stem
+    return (stem.endswith("_mask") and stem[: -len("_mask")] in stems) or (
+        stem.startswith("dynamic_mask_") and stem.removeprefix("dynamic_mask_") in stems
+    )
+
+
+def films_in(sources: Sequence[Path]) -> list[Path]:
+    """Films at the top of a folder that is the only source."""
+    only = sources[0] if len(sources) == 1 and sources[0].is_dir() else None
+    return [] if only is None else sorted(path for path in only.iterdir() if is_video(path))
+
+
+def lone_film(sources: Sequence[Path]) -> list[Path]:
+    """The one film of a folder without photographs. Raises LumigraphError for several."""
+    films = films_in(sources)
+    if not films or next(walk(sources[0]), None) is not None:
+        return []
+    if len(films) > 1:
+        raise LumigraphError(
+            f"{sources[0]} holds {len(films)} films and no photographs; name one of them, such as {films[0]}, or, if "
+            f"cameras filmed at once, add --moving"
+        )
+    return films
 
 
 def named_files(files: list[Path]) -> dict[str, Path]:
