@@ -24,6 +24,7 @@ from textured import bilinear
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import OpenCV
 from lumigraph.commands.cli import main
+from lumigraph.components.fields.charts import unwrap
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame, GeographicOrigin
 from lumigraph.depth_maps import DepthMap
@@ -33,7 +34,7 @@ from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.options import CollisionOptions
 from lumigraph.export.surface import tangents, vertex_normals
 from lumigraph.export.texture import PosedPicture, textured
-from lumigraph.export.texture.atlas import texels_of, unwrap
+from lumigraph.export.texture.atlas import texels_of
 from lumigraph.export.texture.colours import RANKS, TexelColours, first_surface, gains
 from lumigraph.export.texture.detail import normal_map
 from lumigraph.files.ply import read_header

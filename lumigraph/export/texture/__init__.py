@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 
+from ...components.fields.charts import unwrap
 from ...datasets.mesh import Mesh, MeshTexture
 from ...errors import LumigraphError
 from ...system.memory import ask_for
 from ...system.progress import counting
 from ..surface import Faces, Triangles, Vertices, unit, vertex_normals
-from .atlas import texels_of, unwrap
+from .atlas import texels_of
 from .colours import PosedPicture as PosedPicture
 from .colours import blended, collected, gains, spread_to_unseen
 from .colours import photographed as photographed
