@@ -138,7 +138,7 @@ def test_tuning_goes_with_what_was_found(learnt):
     whole, half, none = (told.given(instance=x)._told() for x in (FOUND, f"{FOUND}:1:0.5", "1"))
     change = whole.tensors[0] - made.tensors[0]
     assert change.abs().max() > 1e-3
-    (between,) = told._made(told.codes.code_of(f"{FOUND}:1:0.5", found=told.found.rows[0])[None])
+    (between,) = told._made(told.codes.code_of(f"{FOUND}:1:0.5", told.found.rows)[None])
     torch.testing.assert_close(half.tensors[0] - between.tensors[0], change / 2, atol=1e-5, rtol=1e-4)
     assert torch.equal(none.tensors[0], learnt.given(instance="1")._told().tensors[0])
     assert told.control("instance") == FOUND and learnt.control("instance") == AVERAGE

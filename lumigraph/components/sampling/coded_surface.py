@@ -47,8 +47,7 @@ class CodedSurface(SurfaceMethod):
         """Code of the current instance; that of a single shape without a choice."""
         if len(self._instances) < 2:
             return self.codes.average
-        others = {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
-        return self.codes.code_of(str(self.control("instance")), **others)
+        return self.codes.code_of(str(self.control("instance")), self.found.rows)
 
     @property
     def _instances(self) -> tuple[str, ...]:

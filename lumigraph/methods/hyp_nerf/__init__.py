@@ -318,17 +318,13 @@ class HypNeRF(RayMethod):
     def _told(self) -> HashInstance:
         """Field of the code in the control `instance`; for a code fitted to evidence, with its fine-tuned tensors."""
         value = str(self.control("instance"))
-        (instance,) = self._made(self.codes.code_of(value, **self._others)[None])
+        (instance,) = self._made(self.codes.code_of(value, self.found.rows)[None])
         first, second, share = blend(value)
         weight = (1 - share) * (first == FOUND) + share * (second == FOUND)
         if not weight or not self.tuned:
             return instance
         tensors = [x + weight * change for x, change in zip(instance.tensors, self.tuned.changes, strict=True)]
         return HashInstance(self.shape, tensors)
-
-    @property
-    def _others(self) -> dict[str, Tensor]:
-        return {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
 
     @property
     def controls(self) -> tuple[Control, ...]:

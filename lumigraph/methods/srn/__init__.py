@@ -16,7 +16,7 @@ from ...budget import Effort, Efforts
 from ...camera.rays import Rays, Rendering
 from ...color.blending import before
 from ...components.fields.appearance import fitted
-from ...components.fields.instance_codes import FOUND, InstanceCodes
+from ...components.fields.instance_codes import InstanceCodes
 from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
@@ -219,15 +219,11 @@ class SRN(RayMethod):
     @property
     def code(self) -> Float[Tensor, " code"]:
         """Code of the current scene."""
-        return self.codes.code_of(str(self.control("instance")), **self._others)
-
-    @property
-    def _others(self) -> dict[str, Tensor]:
-        return {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
+        return self.codes.code_of(str(self.control("instance")), self.found.rows)
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        return (self.codes.control(bool(self._others)),)
+        return (self.codes.control(len(self.found.rows) > 0),)
 
     @property
     def evidence_views(self) -> int | None:
