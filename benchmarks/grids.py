@@ -27,6 +27,7 @@ from lumigraph.files import read_json, scene_name, write_bytes, write_json
 from lumigraph.lab.benchmark.cell import Cell, CellSettings, read_rows
 from lumigraph.lab.benchmark.conduct import conduct
 from lumigraph.lab.benchmark.table import size, table
+from lumigraph.methods.dvgo import FEATURE_CHANNELS
 from lumigraph.run import Run
 
 KINDS = {"dvgo": "dense", "plenoxels": "sparse", "tensorf": "factorised", "instant-ngp": "hashed"}
@@ -96,7 +97,7 @@ def lookups(name: str, config: Any) -> tuple[int, int]:
         return 2 * places, places * (config.density_components + config.appearance_components)
     if name == "plenoxels":  # a corner's row, density, and nine harmonics of three colours
         return 8, 8 * (1 + 1 + 27)
-    return 2 * 8, 8 * (1 + config.feature_channels)  # density, and features where they are seen
+    return 2 * 8, 8 * (1 + FEATURE_CHANNELS)  # density, and features where they are seen
 
 
 def at_size(lines: Sequence[dict[str, Any]], wanted: float) -> str:

@@ -1,6 +1,7 @@
 """Objects of scenes: selected by strokes, removed with truth behind them, lifted into other scenes.
 
     python benchmarks/objects.py strokes --scene procedural:still-life,size=200,views=60 --run RUN
+    python benchmarks/objects.py labelled --scene FOLDER --run RUN
     python benchmarks/objects.py removal --scene procedural:still-life,size=100,views=40 --steps 1500
     python benchmarks/objects.py film --part can.ply --run RUN --into OTHER_RUN
 
@@ -9,6 +10,9 @@ two and three strokes on one photograph. A stroke follows the longest path insid
 one inside the thing, each further one inside the largest region that the picture of that photograph has wrong, green
 where something is missing, red where something is too much, and none where nothing thicker than two pixels is wrong.
 Seconds are those of processors for a stroke and the picture of its outcome; features are distilled once before.
+
+labelled: the same strokes on real photographs, FOLDER with `labels/` of some training and some held-out views (0 is
+unknown or background), and where RUN has learnt instances, of each alone where nothing of the whole scene hides it.
 
 removal: things are removed, and held-out views compared with the scene traced without them, at the pixels where each
 thing was seen. Photographs keep its shadow on the floor, so the truth behind has that shadow: the surface behind, lit
@@ -53,6 +57,7 @@ STRIP = 6  # frames
 INNER = 2.5  # pixels from the edge of a region at which a stroke keeps, where there is room
 WORTH = 2.0  # pixels: half the thickness of a region that is worth a stroke
 BEHIND = 1e-3  # scene units in front of a surface, from where a ray sees it lit as it is
+HIDDEN = 1.05  # times the depth of the whole scene, beyond which an instance is hidden
 FINER = 4  # rays across a pixel of the truth
 MIN_PIXELS = 60  # of a thing in the photograph for its strokes
 
@@ -113,6 +118,49 @@ class StrokeOptions:
             either = sum(int((a | b).sum()) for a, b in zip(masks, true, strict=True))
             found.append(both / max(either, 1))
         return {"iou": found, "seconds": seconds}
+
+
+@dataclass(frozen=True)
+class LabelledOptions(StrokeOptions):
+    """Strokes, and learnt instances, against hand-made labels of some photographs."""
+
+    scene: str = "scene"
+    output: Path = Path("objects-labelled.json")
+
+    def conduct(self) -> None:
+        run, scene = open_any(self.run), open_scene(self.scene)
+        method, layer, splits = run.method(), scene.layer("labels"), {}
+        for split in ("train", "test"):
+            splits[split] = torch.tensor([i for i in scene.splits[split].tolist() if layer.planes[i] is not None])
+        photographs = [scene.photograph(i) for i in evenly(scene.splits["train"].tolist(), self.distilled)]
+        about: Any = describe
+        if self.features:
+            about = feature_network(self.features, [x.before(scene.frame.background) for x in photographs[::4]])
+        points = distil_features(method, photographs, about)
+        labelled = replace(scene, splits=splits)
+        numbers = sorted({x for i in splits["test"].tolist() for x in np.unique(layer.stored(i)).tolist()} - {0})
+        rows: dict[int, dict[str, Any]] = {}
+        for number in numbers:
+            view = max(splits["train"].tolist(), key=lambda i: int(true_mask(scene, i, number).sum()))
+            rows[number] = self.of(Selection(method, points), labelled, view, number)
+            if any(x.name == "edit" for x in method.controls):
+                rows[number]["instance"] = self.alone(method, labelled, number)
+            print(
+                number, " ".join(f"{x:.3f}" for x in rows[number]["iou"]), rows[number].get("instance", ""), flush=True
+            )
+        mean = np.mean([x["iou"] for x in rows.values()], 0)
+        print(f"mIoU after 1, 2, 3 strokes: {' '.join(f'{x:.3f}' for x in mean)}")
+        self.output.write_text(json.dumps({"scene": self.scene, "things": rows, "miou": mean.tolist()}, indent=1))
+
+    def alone(self, method: Any, scene: Any, number: int) -> float:
+        """Intersection over union of what is seen of an instance alone, over the held-out labelled views."""
+        both = either = 0
+        for i in scene.splits["test"].tolist():
+            whole, own = method.render(scene.cameras[i]), method.given(edit=f"alone {number}").render(scene.cameras[i])
+            shown = (own.opacity > 0.5) & (own.depth < HIDDEN * whole.depth)
+            truth = torch.from_numpy(true_mask(scene, i, number))
+            both, either = both + int((shown & truth).sum()), either + int((shown | truth).sum())
+        return both / max(either, 1)
 
 
 def true_mask(scene: Any, image: int, number: int) -> np.ndarray:
@@ -260,6 +308,7 @@ class FilmOptions:
 
 Chosen = (
     Annotated[StrokeOptions, tyro.conf.subcommand("strokes")]
+    | Annotated[LabelledOptions, tyro.conf.subcommand("labelled")]
     | Annotated[RemovalOptions, tyro.conf.subcommand("removal")]
     | Annotated[FilmOptions, tyro.conf.subcommand("film")]
 )

@@ -7,7 +7,8 @@
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
-choose rows; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+choose rows; `table: strangers` is of `strangers.py --publish`; `<!-- end of table -->` ends it. Below it are the
+commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from lumigraph.metrics import scores_of
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
-GALLERY = RESULTS.with_name("gallery-cpu.json")
+GALLERY, STRANGERS = RESULTS.with_name("gallery-cpu.json"), RESULTS.with_name("strangers-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 GUIDES = {  # pages about sections of the gallery, in docs/
@@ -65,9 +66,10 @@ class Options:
 
 
 def read() -> dict[str, Any]:
-    """Results of `lumigraph bench methods`, and the gallery's as a part of them."""
+    """Results of `lumigraph bench methods`, and of other programs as parts of them."""
     results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
-    return results | {"gallery": json.loads(GALLERY.read_text("utf-8"))}
+    others = {"gallery": GALLERY, "strangers": STRANGERS}
+    return results | {name: json.loads(path.read_text("utf-8")) for name, path in others.items()}
 
 
 def pages() -> list[Path]:
@@ -117,12 +119,12 @@ def filled(text: str, page: Path, results: dict[str, Any]) -> str:
         kind = match[2]
         if kind not in KINDS or not {*names} <= {*methods.available()}:
             raise SystemExit(f"{page.name}: `{match[0].splitlines()[0]}` names an unknown table or method")
-        of = results["gallery"] if kind in OF_GALLERY else results
+        of = results[OTHERS[kind]] if kind in OTHERS else results
         cells = [row for row in of["cells"] if not names or row["method"] in names]
         if not cells:
             return f"{match[1]}Not measured.\n"
         about, lines = f"Commit `{of['commit']}`; {of['machine'].removeprefix('cpu, ')}, no GPU.", of["commands"]
-        if kind not in OF_GALLERY:
+        if kind not in OTHERS:
             about, lines = f"{about} {scenes_of(cells)}", commands(cells)
         return "\n".join([match[1].rstrip(), *KINDS[kind](cells, page), "", about, "", "```", *lines, "```", ""])
 
@@ -190,19 +192,39 @@ def by_showpiece(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
+def by_verdict(cells: Sequence[Row], page: Path) -> list[str]:
+    """Settings of each method by what became of it, with score and baseline."""
+    verdicts = [name for name in VERDICTS if any(row["verdict"] == name for row in cells)]
+    rows = [["method", *(VERDICTS[name] for name in verdicts)]]
+    for method in dict.fromkeys(row["method"] for row in cells):
+        own = [row for row in cells if row["method"] == method]
+        told = ["; ".join(f"{x['setting']} {x['score']}".strip() for x in own if x["verdict"] == v) for v in verdicts]
+        rows.append([link(method, page), *told])
+    return markdown(rows)
+
+
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
     score = next(iter(scores_of(row)))
     return f"{score.value:.1f} dB" if score.unit == "dB" else f"{score.name} {score.value:.3g} {score.unit}".strip()
 
 
+VERDICTS = {
+    "above": "better than the baseline",
+    "below": "worse, and it says so",
+    "below, unsaid": "worse, and nothing says so",
+    "refused": "refused",
+    "too slow": "too slow",
+    "crash": "crashed",
+}
 KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "methods": by_method,
     "cells": by_cell,
     "sections": by_section,
     "gallery": by_showpiece,
+    "strangers": by_verdict,
 }
-OF_GALLERY = "sections", "gallery"
+OTHERS = {"sections": "gallery", "gallery": "gallery", "strangers": "strangers"}  # where the figures of a table are
 
 
 def scenes_of(cells: Sequence[Row]) -> str:

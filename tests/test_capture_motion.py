@@ -31,7 +31,7 @@ from lumigraph.readers.colmap import read as read_colmap
 from lumigraph.readers.oddities import jumps
 from lumigraph.readers.transforms import read as read_transforms
 from lumigraph.sfm import demand, diagnosis, reconstruction, sphere, worker
-from lumigraph.sfm.agreement import Agreement, agreement
+from lumigraph.sfm.agreement import Agreement, agreement, still_share
 from lumigraph.sfm.coverage import use_of
 from lumigraph.sfm.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.sfm.georeference import georeference, upright
@@ -725,6 +725,50 @@ def test_matches_contradict_wrong_cameras(tmp_path):
     frame = model.frame(frames[0])
     frame.rig_from_world = turn * frame.rig_from_world
     assert agreement(model, database, matches).share == pytest.approx(6 / 8, abs=0.1)
+
+
+def test_a_background_at_rest_behind_a_subject_that_turns_is_noticed(tmp_path):
+    """Forty places that stay where they are in all pictures: matches that verification left out."""
+    model, place = synthetic_model(tmp_path, 8), tmp_path / "database.db"
+    assert still_share(model, place) < 0.05
+    fixed = np.random.default_rng(0).uniform((0, 0), (1024, 768), (40, 2)).astype(np.float32)
+    with closing(pycolmap.Database.open(place)) as database:
+        counts = {}
+        for image in database.read_all_images():
+            own = database.read_keypoints(image.image_id)
+            counts[image.image_id] = len(own)
+            more = np.pad(fixed, ((0, 0), (0, own.shape[1] - 2)))
+            database.update_keypoints(image.image_id, np.concatenate([own, more]))
+        for number in database.read_two_view_geometries()[0]:
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            found = database.read_matches(a, b)
+            at_rest = np.stack([counts[a] + np.arange(40), counts[b] + np.arange(40)], 1)
+            database.delete_matches(a, b)
+            database.write_matches(a, b, np.concatenate([found, at_rest]).astype(np.uint32))
+    assert still_share(model, place) > 0.9 and agreement(model, place, read_matches(place)).share > 0.99
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_a_subject_that_turned_is_masked_unasked(masked, tmp_path, monkeypatch, capsys):
+    """And where no object can be told from the rest, the capture stands, with a warning."""
+    finding = {"photograph": "", "fault": "turning subject", "evidence": "it turns", "advice": "mask it"}
+    monkeypatch.setattr(command, "show_result", lambda folder, result, onward: None)
+    made = []
+
+    def show_masks(folder, onward):
+        if not masked:
+            raise LumigraphError("No object")
+        made.append(onward)
+
+    monkeypatch.setattr(command, "show_masks", show_masks)
+    command.show_all(tmp_path, {"findings": []}, "train it")
+    command.show_all(tmp_path, {"findings": [finding]}, "train it")
+    said = capsys.readouterr()
+    assert made == ["train it"] * masked and ("warning: No object" in said.err) is not masked
+    assert ("train it" in said.out) is not masked
+    if not masked:
+        with pytest.raises(LumigraphError, match="No object"):
+            command.show_all(tmp_path, {"findings": [finding]}, "train it", masked=True)
 
 
 @pytest.mark.parametrize("shared", [0, 3])

@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import warnings
+import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import av
 import numpy as np
 import pillow_heif
 import pytest
+import torch
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace
 from budgets import budget
+from deep_files import write_png16
 from PIL import Image, ImageCms, PngImagePlugin
 
+import lumigraph
 from lumigraph.color import display
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
+from lumigraph.color.tags import SRGB_PROFILE
+from lumigraph.datasets.mesh import Mesh, MeshTexture
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.export.mesh_file import write_mesh
+from lumigraph.export.panorama import save_sphere
+from lumigraph.export.video import open_video
+from lumigraph.figures import png, save_picture, to_bytes
 from lumigraph.files.exr import LUMINANCE, from_luminance
 from lumigraph.light import EnvironmentLight
 from lumigraph.readers.numbers import read_numbers
 from lumigraph.readers.pictures import read_deep, read_image, reads_heic
-from lumigraph.readers.profiles import SRGB_PROFILE, curve_of
+from lumigraph.readers.profiles import colours_of, curve_of
 from lumigraph.sfm.photos import gather
 from lumigraph.sfm.photos.film import opened, tags_of
 
@@ -136,12 +148,15 @@ def test_pixels_become_square_and_frames_whole(tmp_path):
         assert one.tags.interlaced and len(list(one.frames())) == 12
 
 
+def mirrored(film: bytes, width: int) -> bytes:
+    """An MP4 file whose display matrix mirrors it."""
+    begin = film.index(b"tkhd") + 4 + 4 + 20 + 16
+    return film[:begin] + struct.pack(">9i", -65536, 0, 0, 0, 65536, 0, width << 16, 0, 1 << 30) + film[begin + 36 :]
+
+
 def test_a_mirrored_film_is_turned_back(tmp_path):
     path = film(tmp_path / "a.mp4", PLAIN)
-    data = bytearray(path.read_bytes())
-    begin = data.index(b"tkhd") + 4 + 4 + 20 + 16
-    data[begin : begin + 36] = struct.pack(">9i", -65536, 0, 0, 0, 65536, 0, SIZE[0] << 16, 0, 1 << 30)
-    path.write_bytes(data)
+    path.write_bytes(mirrored(path.read_bytes(), SIZE[0]))
     np.testing.assert_allclose(means(first_picture(path)), PATCHES[::-1], atol=3)
 
 
@@ -257,20 +272,18 @@ def test_profiles_in_other_places_count_too(tmp_path):
         np.testing.assert_allclose(means(read_image(tmp_path / name, True, SIZE)), PATCHES, atol=4, err_msg=name)
 
 
+def with_profile(png: bytes, profile: bytes) -> bytes:
+    """A PNG file with a profile, behind its header."""
+    body = b"iCCP" + b"made\0\0" + zlib.compress(profile)
+    return png[:33] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[33:]
+
+
 def test_sixteen_bits_keep_their_precision(tmp_path):
     ramp = np.linspace(0.2, 0.3, SIZE[0])
     values = np.repeat(np.repeat(ramp[None, :, None], SIZE[1], 0), 3, -1)
     deep = np.rint(values * 65535).astype(np.uint16)
-    image = av.VideoFrame.from_ndarray(deep, format="rgb48le")
-    with av.open(str(tmp_path / "plain.png"), "w", format="image2", options={"update": "1"}) as container:
-        stream = container.add_stream("png", rate=1)
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "rgb48be"
-        container.mux(stream.encode(image))
-        container.mux(stream.encode(None))
-    data = (tmp_path / "plain.png").read_bytes()
-    body = b"iCCP" + b"made\0\0" + zlib.compress(P3)
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
+    write_png16(tmp_path / "plain.png", deep)
+    (tmp_path / "a.png").write_bytes(with_profile((tmp_path / "plain.png").read_bytes(), P3))
     found = read_deep(tmp_path / "a.png", True)
     assert found.dtype == np.uint16 and len(np.unique(found)) > 150
     expected = srgb_from_linear(values**2.2)  # grey has the same primaries
@@ -299,6 +312,58 @@ def test_copies_are_srgb_and_say_so(tmp_path):
     with Image.open(photo.path) as copy:
         assert copy.info["icc_profile"] == SRGB_PROFILE and copy.size == SIZE[::-1]
         np.testing.assert_allclose(means(np.rot90(np.asarray(copy))), PATCHES, atol=5)
+
+
+def glb_texture(path: Path) -> bytes:
+    data = path.read_bytes()
+    return data[data.index(b"\xff\xd8\xff") :]
+
+
+def in_archive(path: Path) -> bytes:
+    with zipfile.ZipFile(path) as packed:
+        return packed.read("colours.png")
+
+
+RGB = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
+PAINTED = Mesh(*TRIANGLE, np.zeros((3, 3), np.uint8), MeshTexture(np.eye(3)[:, :2], to_bytes(RGB).numpy(), None))
+WRITERS: dict[str, Callable[[Path], object]] = {  # of pictures, by a file that one writes or that holds one
+    "figure.png": lambda path: save_picture(path, RGB),
+    "notebook.png": lambda path: path.write_bytes(png(RGB)),
+    "sphere.png": lambda path: save_sphere(path, RGB, whole=True),
+    "sphere.jpg": lambda path: save_sphere(path, RGB, whole=True),
+    "mesh.glb": lambda path: write_mesh(path, PAINTED),
+    "mesh.usdz": lambda path: write_mesh(path, PAINTED),
+    "mesh.png": lambda path: write_mesh(path.with_suffix(".obj"), PAINTED),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_pictures_that_are_written_are_tagged_srgb(tmp_path, name):
+    WRITERS[name](path := tmp_path / name)
+    data = {".glb": glb_texture, ".usdz": in_archive}.get(path.suffix, Path.read_bytes)(path)
+    with Image.open(io.BytesIO(data)) as image:
+        assert image.info.get("srgb") == 0 or image.info.get("icc_profile") == SRGB_PROFILE
+        assert colours_of(image).are_srgb and ("xmp" in str(image.info).lower()) == name.startswith("sphere")
+
+
+def test_films_that_are_written_are_tagged_bt709(tmp_path):
+    with open_video(tmp_path / "a.mp4") as film:
+        film.add(to_bytes(RGB))
+    tags = tags_of(tmp_path / "a.mp4")
+    assert (tags.primaries, tags.transfer, tags.matrix, tags.full_range) == (1, 1, 1, False)
+
+
+def test_pictures_without_a_tag_hold_numbers_or_lie_in_a_page():
+    """Everything else is written by `color.tags`."""
+    package, known = Path(lumigraph.__file__).parent, {
+        "app/pictures.py", "app/reduce.py", "export/page.py",  # for browsers, which take them for sRGB
+        "datasets/images/stream.py", "derive/parts.py", "exchange/snerg.py", "exchange/sog.py", "export/depth.py",
+        "export/usdz.py", "light/probes/storage.py", "readers/objects/__init__.py", "sfm/folder.py",
+    }  # fmt: skip
+    untagged = re.compile(r'\.save\(.*"(PNG|JPEG|WEBP|png)"|(fromarray|to_image)\(.*\)\.save\(')
+    found = {str(x.relative_to(package)) for x in package.rglob("*.py") if untagged.search(x.read_text())}
+    assert found == known
 
 
 def test_curves_of_profiles():

@@ -69,6 +69,7 @@ from lumigraph.training import fit
 from lumigraph.training.loop import rehearse
 
 STEPS, PAUSES, LATER = 24, (5, 18), 48
+UNLIKE_STEPS = 6
 SHOWN = 4  # the camera whose picture is looked at, a held-out one
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 NAMES = methods.available()  # tiny adds the tests' own
@@ -228,6 +229,21 @@ def test_it_learns(taught, monkeypatch):
     if taught.kind.learns_from is Scene:
         fresh = taught.straight.new_method(taught.device).eval()
         assert evaluate(taught.method, taught.data).psnr > evaluate(fresh, taught.data).psnr + 0.5
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if methods.find(name).learns_from is Scene])
+@pytest.mark.parametrize("device", DEVICES)
+def test_an_unlike_scene_is_learnt_or_refused_in_a_sentence(name, device, tmp_path):
+    data = tiny.stranger()
+    try:
+        run = begin(name, data, tmp_path / "run", device)
+        fit(method := run.new_method(device), data, run, steps=UNLIKE_STEPS, show=False)
+        method.eval()
+        sound(method.render(data.cameras[SHOWN]).cpu(), (tiny.SIZE, tiny.SIZE))
+    except LumigraphError as refusal:
+        assert len(str(refusal)) > 40
+    else:
+        assert all(value.isfinite().all() for value in method.parameters())
 
 
 def test_every_parameter_gets_a_finite_gradient(taught):

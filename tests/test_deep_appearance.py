@@ -7,17 +7,22 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+import trimesh
 from budgets import budget
 
+from lumigraph.components.image_based import depth
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.deep_appearance import (
     DeepAppearance,
+    charted_hull,
     grid_faces,
     sampled,
+    texel_places,
     textured,
     tracked_meshes,
     unwrapped,
 )
+from lumigraph.run.checkpoint import take_shapes
 
 pytestmark = budget("methods", 5)
 
@@ -30,8 +35,8 @@ def sphere(rows: int, columns: int, radius: float = 0.6) -> torch.Tensor:
 
 def test_a_photograph_is_unwrapped():
     """The ball's colour is where its surface points, so the texture is known."""
-    grid, (faces, _) = sphere(49, 65), grid_faces(49, 65)
-    rgb, shown = unwrapped(tiny.scene().photograph(1), grid, faces, 64)
+    vertices, (faces, uv) = sphere(49, 65).view(-1, 3), grid_faces(49, 65)
+    rgb, shown = unwrapped(tiny.scene().photograph(1), vertices, faces, *texel_places(vertices, faces, uv, 64))
     centre = (torch.arange(64) + 0.5) / 64
     place = sphere(49, 65).movedim(-1, 0)[None]
     v, u = torch.meshgrid(centre, centre, indexing="ij")
@@ -41,13 +46,13 @@ def test_a_photograph_is_unwrapped():
 
 
 def test_unwrapping_and_rendering_are_inverse():
-    grid, (faces, uv) = sphere(49, 65), grid_faces(49, 65)
+    vertices, (faces, uv) = sphere(49, 65).view(-1, 3), grid_faces(49, 65)
     photograph = tiny.scene().photograph(1)
-    rgb, shown = unwrapped(photograph, grid, faces, 128)
+    rgb, shown = unwrapped(photograph, vertices, faces, *texel_places(vertices, faces, uv, 128))
     from lumigraph import kernels
 
     beside = kernels.neighbours(faces)
-    seen = textured(grid.view(-1, 3), rgb.float() / 255, faces, beside, uv, photograph.camera, torch.ones(1, 3))
+    seen = textured(vertices, rgb.float() / 255, faces, beside, uv, photograph.camera, torch.ones(1, 3))
     inner = tiny.ball(photograph.camera.pose[0])[0] < 2.6
     assert float((seen.rgb - photograph.rgb)[inner].abs().mean()) < 0.02
     assert float((seen.depth - tiny.ball(photograph.camera.pose[0])[0])[inner].abs().max()) < 0.02
@@ -86,6 +91,48 @@ def test_expressions_are_interpolated():
     torch.testing.assert_close(half, 0.5 * (first + second))
     assert (first != second).any()
     assert [control.name for control in method.controls] == ["time"]
+
+
+def test_the_hull_of_a_ball_is_charted():
+    scene = tiny.scene()
+    rows = charted_hull(scene, 600, 64)
+    corners, uv = rows[:, :9].reshape(-1, 3), rows[:, 9:].reshape(-1, 2)
+    away = corners.norm(dim=-1) - 0.6  # a dozen small pictures enclose it loosely
+    assert len(rows) <= 620 and float(away.min()) > -0.05 and float(away.max()) < 0.33 and float(away.mean()) < 0.15
+    assert 0 <= float(uv.min()) and float(uv.max()) <= 1
+    faces = torch.arange(len(corners)).view(-1, 3)
+    places, normals = texel_places(corners, faces, uv, 64)
+    assert float((places.norm(dim=-1) - 0.6).abs().max()) < 0.33
+    assert float((normals * places).sum(-1).mean()) > 0.5
+
+
+def test_the_hull_keeps_holes_and_separate_things(monkeypatch):
+    """A frame with a window, and a block beside it: two closed surfaces, one of genus 1."""
+    solid = torch.zeros(64, 64, 64, dtype=torch.bool)
+    solid[8:40, 20:28, 10:50] = True
+    solid[16:32, :, 20:40] = False
+    solid[48:58, 20:40, 20:40] = True
+    monkeypatch.setattr(depth, "visual_hull", lambda scene, cells: solid)
+    scene = tiny.scene()
+    hull = depth.hull_surface(replace(scene, frame=replace(scene.frame, bounds=((-1, -1, -1), (1, 1, 1)))))
+    made = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+    assert made.is_watertight and made.volume > 0
+    assert sorted(part.euler_number for part in made.split()) == [0, 2]
+
+
+def test_a_still_object_is_shown_by_its_hull_and_kept():
+    scene = tiny.scene()
+    method = DeepAppearance(scene.frame, DeepAppearance.smallest())
+    old = method.state_dict()
+    method.begin(scene)
+    seen = method.eval().render(scene.cameras[1])
+    assert float((seen.opacity - scene.photograph(1).alpha).abs().mean()) < 0.05
+    again = DeepAppearance(scene.frame, DeepAppearance.smallest()).eval()
+    take_shapes(again, method.state_dict())
+    again.load_state_dict(method.state_dict())
+    torch.testing.assert_close(again.render(scene.cameras[1]).rgb, seen.rgb)
+    del old["hull.rows"]  # of a run before there were charts
+    DeepAppearance(scene.frame, DeepAppearance.smallest()).load_state_dict(old)
 
 
 def test_a_scene_without_a_surface_is_refused():

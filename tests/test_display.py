@@ -63,6 +63,7 @@ def test_a_cloud_is_counted_before_and_while_it_learns():
 def test_how_long_it_will_take():
     assert how_long(Budget(seconds=600.0), 0, 0.0) == "for 10 min"
     assert how_long(Budget(seconds=600.0), 50, 540.0) == "for 60 s"
+    assert how_long(Budget(seconds=5.0), 0, 7.73) == "without a step of learning"
     assert how_long(Budget(500, quality="draft"), 0, 0.0).startswith("for 500 steps (quality: draft); how long")
     assert "100 of them done" in how_long(Budget(500), 100, 9.0)
     assert machine(torch.device("cpu")).startswith("on the CPU with ")

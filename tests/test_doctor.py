@@ -21,6 +21,8 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined, rendered
 from lumigraph.evaluation.report import write_report
+from lumigraph.methods.lumigraph import Lumigraph
+from lumigraph.metrics import psnr
 from lumigraph.opening import read_capture
 from lumigraph.sfm.coverage import coverage
 from lumigraph.sfm.doctor import LACKING, Finding, Residual, deviations, findings, grouped, of_residuals
@@ -162,6 +164,15 @@ def test_clouds_are_compared_at_the_size_of_the_photographs():
     assert shot.rgb.shape == seen.rgb.shape == (height, width, 3) and camera.size.tolist() == [[width, height]]
     torch.testing.assert_close(seen.rgb, means)
     assert not torch.allclose(seen.rgb, method.render(camera).rgb, atol=1e-3)
+
+
+def test_photographs_that_a_method_shows_themselves_are_compared_without_aliasing():
+    """A lumigraph shows each photograph at its camera: reduced, it is the reduced photograph."""
+    scene = tiny.scene()
+    method = Lumigraph(scene.frame, replace(Lumigraph.smallest(), geometry="plane")).eval()
+    method.begin(scene)
+    shot, _, seen = rendered(method, scene, 3, int(scene.cameras.size.max()) / 4)
+    assert psnr(seen.rgb, shot.before(scene.frame.background)) > 45
 
 
 def test_the_worst_photographs_stand_in_the_report(learnt):

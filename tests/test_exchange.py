@@ -24,6 +24,8 @@ from lumigraph.exchange.codes import morton_order
 from lumigraph.exchange.spz import gzipped
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians, turned
+from lumigraph.geometry import to_matrix
+from lumigraph.kernels import spherical_harmonics
 
 pytestmark = budget("exports", 10)
 
@@ -305,7 +307,45 @@ def test_reads_older_spz_by_hand(tmp_path, version):
     path.write_bytes(header + body)  # and without gzip
     assert same(read_gaussians(path), found)
     path.write_bytes(gzip.compress(header[:14] + b"\x02\x00" + body + b"an extension"))
-    assert same(read_gaussians(path), found)
+    with pytest.warns(LumigraphWarning, match="extensions passed over: 0x65206e61$"):
+        assert same(read_gaussians(path), found)
+
+
+AXES = {"R": [1.0, 0, 0], "L": [-1.0, 0, 0], "D": [0.0, 1, 0], "U": [0.0, -1, 0], "F": [0.0, 0, 1], "B": [0.0, 0, -1]}
+
+
+@pytest.mark.parametrize(("number", "axes"), [(4, "RUB"), (7, "LUF"), (8, "RUF"), (12, "RFU"), (15, "LBU"), (0, "RUB")])
+def test_spz_in_other_axes(tmp_path, number, axes):
+    """Adobe's extension: positions, covariances and colours by direction are those that the letters give, mirrored too;
+    its other one, and those that nobody knows, are named."""
+    path, cloud = tmp_path / "a.spz", make(9)
+    write_gaussians(path, cloud)
+    plain, data = read_gaussians(path), path.read_bytes()
+    block = struct.pack("<III", 0xADBE0003, 4, number) + struct.pack("<IIfff", 0xADBE0002, 12, 0, 1, 2)
+    block += struct.pack("<II", 0x4E410001, 3) + b"abc"
+    path.write_bytes(data[:14] + b"\x02" + data[15:16] + struct.pack("<I12x", 32 + len(block)) + block + data[32:])
+    with pytest.warns(LumigraphWarning, match="passed over: SPZ_ADOBE_safe_orbit_camera, 0x4e410001$"):
+        found = read_gaussians(path)
+    matrix = torch.tensor([AXES[letter] for letter in axes]).T @ HALF_TURN
+    torch.testing.assert_close(found.means, plain.means @ matrix.T)
+    covariances = (
+        rotation @ torch.diag_embed((2 * one.log_scales).exp()) @ rotation.mT
+        for one in (plain, found)
+        for rotation in [to_matrix(one.quaternions / one.quaternions.norm(dim=-1, keepdim=True))]
+    )
+    torch.testing.assert_close(matrix @ next(covariances) @ matrix.T, next(covariances), atol=1e-7, rtol=1e-5)
+    seen = torch.nn.functional.normalize(torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    before, after = (spherical_harmonics(x, 4) for x in (seen, seen @ matrix.T))
+    colours = torch.einsum("dk,nkc->ndc", before, plain.harmonics)
+    torch.testing.assert_close(torch.einsum("dk,nkc->ndc", after, found.harmonics), colours, atol=1e-5, rtol=0)
+
+
+def test_spz_of_degree_4_keeps_degree_3(tmp_path):
+    rest = bytes(range(60, 132))
+    (tmp_path / "a.spz").write_bytes(spz(degree=4, body=bytes(20) + rest))
+    (tmp_path / "b.spz").write_bytes(spz(degree=3, body=bytes(20) + rest[:45]))
+    with pytest.warns(LumigraphWarning, match="degree 4 are passed over"):
+        assert same(read_gaussians(tmp_path / "a.spz"), read_gaussians(tmp_path / "b.spz"))
 
 
 def test_reads_splat_by_hand(tmp_path):
@@ -624,7 +664,8 @@ def spz(version: int = 3, count: int = 1, degree: int = 0, magic: bytes = b"NGSP
         (gzip.decompress(spz(version=5)), "version 5"),
         (gzip.decompress(spz(version=4)), "no table"),  # it has its own container, not gzip's
         (b"NGSP\x04", "ends early"),
-        (spz(degree=4), "degree 4"),
+        (spz(degree=5), "degree 5"),
+        (gzip.compress(gzip.decompress(spz())[:14] + b"\x80\0" + bytes(26)), "levels of detail"),
         (spz(degree=1), "truncated"),
         (spz(count=2), "truncated"),
         (spz(count=2**32 - 1), "cannot be there"),

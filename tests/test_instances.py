@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -11,7 +12,8 @@ from balls import BLUE, RED, WHITE, Splatted, eye
 from budgets import budget
 
 from lumigraph.components.instances import edit_of
-from lumigraph.datasets.scene import Photograph
+from lumigraph.datasets.images import Layer, LayerSource
+from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians import joined
 from lumigraph.gaussians.splatting import splat, view_of
@@ -72,6 +74,26 @@ def test_masks_teach_each_gaussian_its_instance(learnt):
     assert (labels == truth)[seen].float().mean() > 0.97 and (labels == truth).float().mean() > 0.9
 
 
+def test_a_photograph_without_labels_learns_from_one_that_has_some(monkeypatch):
+    """Its own unknown labels teach nothing; those of the only labelled photograph do, from its camera."""
+    method, scene = method_of(two_balls()), tiny.scene()
+    step = step_at(method, eye(EYES[0]))
+    step.rgb = step.picture.rgb
+    other = step_at(method, eye(EYES[2])).photograph
+    step.photograph.extra["labels"] = torch.full_like(other.extra["labels"], -1)
+    step.photograph = replace(step.photograph, alpha=None)
+    planes = [None] * len(scene.names)
+    planes[5] = LayerSource(lambda: np.zeros(0))
+    layer = Layer(scene.images, planes, np.dtype(np.uint8), 1, "index")
+    method.identities.layers(replace(scene, layers={"labels": layer}))
+    asked = []
+    monkeypatch.setattr(Scene, "photograph", lambda self, index, layers: asked.append(index) or other)
+    method.identities.regularize(step)
+    assert asked == [5] and method.identities.seen.all() and step.terms["identity"] > 0
+    step.terms["identity"].backward()
+    assert method.identities.codes.grad.abs().sum() > 0 and method.cloud.means.grad is None
+
+
 def test_identities_change_nothing_else():
     """Gradients reach codes and classifier alone."""
     method = method_of(two_balls())
@@ -92,14 +114,22 @@ def test_neighbours_agree_when_their_codes_do():
 
 
 def test_codes_follow_a_cloud_that_changes():
-    cloud = two_balls()
-    method = method_of(cloud)
+    """Before codes are learnt too, where a cloud grows and is pruned after one step."""
+    method = method_of(two_balls())
+    method.cloud.optimizers()
     codes = method.identities.codes.detach().clone()
     order = torch.tensor([5, 5, 2000])
-    method.identities.follow(cloud.means[order])
-    assert torch.equal(method.identities.codes.detach(), codes[order])
-    method.identities.prune(torch.tensor([True, False, True]))
+    method.cloud.rebuild(order, order == 2000)
+    method.prune(torch.tensor([True, False, True]))
     assert torch.equal(method.identities.codes.detach(), codes[order[[0, 2]]])
+
+
+def test_codes_of_an_older_run_are_those_of_the_nearest():
+    method = method_of(two_balls())
+    codes, order = method.identities.codes.detach().clone(), torch.tensor([5, 5, 2000])
+    method.cloud.replace(method.cloud.gaussians()[order])
+    method.identities.before_raster(method.step_on(Photograph(eye(EYES[0]), torch.zeros(1, 1, 3)), 0))
+    assert torch.equal(method.identities.codes.detach(), codes[order])
 
 
 def test_an_instance_is_removed_moved_copied_and_alone(learnt):

@@ -67,6 +67,87 @@ def test_files_keep_rows_and_colours(tmp_path, suffix):
     assert (np.abs(found - values) <= tolerance).all()
 
 
+def rgbe(values: np.ndarray) -> np.ndarray:
+    """Bytes of mantissas and exponent (Ward 1991)."""
+    most = values.max(-1)
+    exponent = np.where(most > 0, np.frexp(most)[1], -128)
+    mantissas = np.floor(values / np.ldexp(1.0, exponent)[..., None] * 256)
+    return np.concatenate([mantissas, exponent[..., None] + 128], -1).astype(np.uint8)
+
+
+def runs(line: np.ndarray) -> bytes:
+    """A line of runs for each channel: pairs of equal bytes as runs, the others one by one."""
+    found = bytes((2, 2, len(line) >> 8, len(line) & 255))
+    for channel in line.T.tolist():
+        at = 0
+        while at < len(channel):
+            twice = channel[at : at + 2] == [channel[at]] * 2
+            found += bytes((130, channel[at]) if twice else (1, channel[at]))
+            at += 2 if twice else 1
+    return found
+
+
+def repeats(line: np.ndarray) -> bytes:
+    """A line of the first format: a pixel, then how often it is repeated."""
+    found, at = b"", 0
+    while at < len(line):
+        same = 1
+        while at + same < len(line) and (line[at + same] == line[at]).all() and same < 250:
+            same += 1
+        found += line[at].tobytes() + (bytes((1, 1, 1, same - 1)) if same > 1 else b"")
+        at += same
+    return found
+
+
+def write_radiance(path, values, order="-Y +X", lines="FORMAT=32-bit_rle_rgbe", encode=runs, first="#?RADIANCE"):
+    """A Radiance picture whose lines are in an order."""
+    turned = values if "Y" in order[:2] else values.swapaxes(0, 1)
+    flips = [sign != ("-" if axis == "Y" else "+") for sign, axis in (order[:2], order[3:])]
+    turned = turned[:: -1 if flips[0] else 1, :: -1 if flips[1] else 1]
+    size = f"{order[:2]} {turned.shape[0]} {order[3:]} {turned.shape[1]}"
+    pixels = b"".join(encode(line) for line in rgbe(turned))
+    path.write_bytes(f"{first}\n{lines}\n\n{size}\n".encode() + pixels)
+
+
+@pytest.mark.parametrize("order", ["-Y +X", "+Y +X", "-Y -X", "+X -Y", "-X +Y", "+X +Y"])
+@pytest.mark.parametrize("encode", [runs, repeats, np.ndarray.tobytes])
+def test_radiance_of_every_order_and_encoding(tmp_path, order, encode):
+    values = ramp(8).numpy()
+    values[2:4, 3:9] = values[2, 3]
+    values[5] = 0
+    write_radiance(tmp_path / "light.hdr", values, order, encode=encode)
+    found = EnvironmentLight.open(tmp_path / "light.hdr").radiance.numpy()
+    assert (np.abs(found - values) <= values.max(-1, keepdims=True) / 128).all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "factor"),
+    [
+        ("#?RADIANCE\nFORMAT=32-bit_rle_rgbe", 1.0),
+        ("# made by hand\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2.0\nEXPOSURE= 4", 0.125),
+        ("SOFTWARE=x\nGAMMA=1\nPRIMARIES=0.64 0.33 0.3 0.6 0.15 0.06 0.3127 0.329\nFORMAT=32-bit_rle_rgbe", 1.0),
+        ("COLORCORR= 2 2 2\nFORMAT=32-bit_rle_rgbe", 0.5),
+    ],
+)
+def test_headers_of_radiance(tmp_path, lines, factor):
+    values = ramp(8).numpy()
+    for first in ("#?RADIANCE", "#?RGBE"):
+        write_radiance(tmp_path / "light.hdr", values, lines=lines, first=first)
+        found = EnvironmentLight.open(tmp_path / "light.hdr").radiance.numpy()
+        assert (np.abs(found - factor * values) <= factor * values.max(-1, keepdims=True) / 128).all()
+
+
+def test_radiance_in_xyz_and_faults(tmp_path):
+    path, white = tmp_path / "light.hdr", np.full((8, 16, 3), 4.0)
+    write_radiance(path, white, lines="FORMAT=32-bit_rle_xyze")
+    assert EnvironmentLight.open(path).radiance.sub(4).abs().max() < 0.05
+    whole = path.read_bytes()
+    for broken in (whole[:-9], whole[:40], whole.replace(b"-Y 8 +X 16", b"-Y 80000 +X 160000"), b"#?RADIANCE\n\n"):
+        path.write_bytes(broken)
+        with pytest.raises(LumigraphError, match="cannot be read"):
+            EnvironmentLight.open(path)
+
+
 def test_resizing_keeps_energy_and_mean():
     light = EnvironmentLight(ramp(24))
     smaller, odd = light.resized(16, 32), light.resized(7, 10)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
+import warnings
 from collections import defaultdict
 from dataclasses import replace
 from types import SimpleNamespace
@@ -27,7 +29,7 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.depth_maps import Tolerance, agreed, render_depth_maps
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
@@ -37,6 +39,7 @@ from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, si
 from lumigraph.files.ply import read_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
+from lumigraph.readers.surveyed import read_surveyed
 from lumigraph.run import Run
 from lumigraph.training import fit
 
@@ -154,6 +157,40 @@ def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
     mesh = extract_mesh(Seen(ball(), frame), around(), MeshOptions(cell_size=CELL, extent=2.0))
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
+
+
+class Scanned(Seen):
+    """A room of 8 x 6 x 3 whose walls were measured, around a box of interest of 2."""
+
+    def __init__(self):
+        super().__init__(ball(), OPEN)
+
+    def mesh(self) -> Mesh:
+        room = trimesh.creation.box((8.0, 6.0, 3.0)).subdivide().subdivide().subdivide()
+        colours = np.full((len(room.vertices), 3), 9, np.uint8)
+        return Mesh(np.array(room.vertices), np.array(room.faces), colours)
+
+
+def test_a_measured_mesh_is_whole_and_a_cut_is_said():
+    options = MeshOptions(smooth=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh = extract_mesh(Scanned(), around(), options)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (8, 6, 3))
+    with pytest.warns(LumigraphWarning, match=r"outside the meshed region and is left out; a larger --extent") as said:
+        part = extract_mesh(Scanned(), around(), replace(options, extent=3.5))
+    whole, kept = (float(as_trimesh(x).area) for x in (mesh, part))
+    assert f"{100 * (1 - kept / whole):.2g} %" in str(said[0].message) and kept < 0.7 * whole
+    assert (part.vertices.max(0) <= 3.5).all()
+
+
+def test_what_a_box_cuts_is_said():
+    """A ball of radius 1.4 that a box of interest of half-size 1 cuts."""
+    cameras, big = around(), Seen(ball(1.4), Frame(near=0.1, reach=4.0))
+    with pytest.warns(LumigraphWarning, match="of the surface lies outside the meshed region"):
+        extract_mesh(big, cameras, MeshOptions(cell_size=1 / 8, extent=1.0))
+    with pytest.warns(LumigraphWarning, match="of the surface lies outside the crop"):
+        extract_points(big, cameras, PointsOptions(count=100), Sphere((1.4, 0.0, 0.0), 1.0))
 
 
 def test_smoothing_takes_noise_and_leaves_the_volume():
@@ -519,9 +556,8 @@ def test_far_from_the_origin_meshes_keep_their_places(tmp_path, solid_ball, endi
     path = tmp_path / f"a{ending}"
     write_mesh(path, far)
     if ending == ".usdz":  # about its own base, with the place as data
-        data = path.read_bytes()
-        row = data[data.index(b"sourceFromUpright") :].split(b"(", 5)[5].split(b")")[0]
-        x, y, z, _ = map(float, row.split(b","))
+        layer = pytest.importorskip("pxr.Sdf").Layer.FindOrOpen(str(path))
+        x, y, z, _ = layer.customLayerData["sourceFromUpright"].GetRow(3)
         assert abs(x - FAR[0]) < 1 and abs(y - FAR[1]) < 1
         return
     found = trimesh.load(path, process=False, maintain_order=True)
@@ -537,6 +573,7 @@ def test_far_from_the_origin_meshes_keep_their_places(tmp_path, solid_ball, endi
 
 
 def test_far_points_are_doubles(tmp_path):
+    laspy = pytest.importorskip("laspy")
     random = np.random.default_rng(0)
     near = random.normal(size=(500, 3))
     for offset, kind in ((0.0, "<f4"), (FAR, "<f8")):
@@ -546,3 +583,14 @@ def test_far_points_are_doubles(tmp_path):
         assert rows.dtype["x"].str == kind
         found = np.stack([rows[name] for name in "xyz"], 1)
         np.testing.assert_allclose(found, near + offset, atol=1e-5)
+        for name in ("a.las", "a.laz"):
+            write_points(tmp_path / name, points)
+            np.testing.assert_allclose(read_surveyed(tmp_path / name).points, near + offset, atol=1e-4)
+            there = laspy.read(tmp_path / name)
+            assert set(there.green) == {9 * 257} and set(there.NormalZ) == {1} and set(there.NormalX) == {0}
+
+
+def test_las_without_its_library_names_the_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(LumigraphError, match=r"lumigraph\[lidar\]"):
+        write_points(tmp_path / "a.las", PointCloud(np.eye(3), np.eye(3), np.eye(3, dtype=np.uint8)))

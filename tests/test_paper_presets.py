@@ -623,11 +623,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
     "view-interpolation": {  # Chen and Williams 1993: between two photographs
         "warped_views": 2,
     },
-    "tsdf-fusion": {  # niessner/VoxelHashing's parameters, as in theNded/MeshHashing, include/hash_param.h
+    "tsdf-fusion": {  # niessner/VoxelHashing, DepthSensing/zParametersDefault.txt
         "voxel_size": 0.004,
         "truncation": 5.0,  # 0.02 m
+        "truncation_growth": 0.01,
         "max_weight": 255.0,
-        "max_depth": 4.0,
+        "max_depth": 3.0,
     },
     "voxel-fit": {  # no paper's; voxels, opacity and step of sunset1995/DirectVoxGO, configs/default.py
         "voxels": 160**3,

@@ -500,3 +500,95 @@ def test_a_film_of_the_room_is_in_metres_with_the_truth_beside():
     assert float((place - stage.cameras["test"].position[0]).norm()) < 1e-5
     with pytest.raises(LumigraphError, match="no option 'depth'"):
         open_scene("procedural:still-life,depth")
+
+
+# Nuisances
+
+
+def nuisance(text: str, scene: str = "still-life,size=16,views=6"):
+    return open_scene(f"procedural:{scene}{text and ','}{text}")
+
+
+def test_nuisances_are_off_by_default_and_compose():
+    plain, none = nuisance(""), nuisance("open=0,exposure=0,scale=1,step=1,holes=")
+    assert plain.names == none.names and plain.frame == none.frame
+    assert torch.equal(plain.photograph(5).rgb, none.photograph(5).rgb)
+    many = nuisance(
+        "open=3,clutter=4,shape=2,exposure=1,blur=2,white_balance=10,poses=1,labels=20,scale=10,order,few=3"
+    )
+    assert len(many.splits["train"]) == 3 and not many.frame.has_alpha and many.frame.is_open
+
+
+def test_a_unit_and_an_origin_change_the_source_and_not_the_scene():
+    plain = nuisance("")
+    for text, scale in (("scale=0.001", 1e-3), ("scale=1e5,offset=1e6", 1e5)):
+        moved = nuisance(text)
+        assert moved.frame.to_source.scale == pytest.approx(scale * plain.frame.to_source.scale, rel=1e-6)
+        torch.testing.assert_close(moved.cameras.pose, plain.cameras.pose, atol=1e-4, rtol=0)
+        depth, other = (one.photograph(5, ("depth",)).extra["depth"] for one in (plain, moved))
+        torch.testing.assert_close(depth, other, atol=1e-5, rtol=1e-5)
+
+
+def test_training_poses_are_off_by_pixels_and_the_truth_is_known():
+    exact, off = nuisance("", "still-life,size=64,views=30"), nuisance("poses=3", "still-life,size=64,views=30")
+    train, test = off.splits["train"], off.splits["test"]
+    assert torch.equal(exact.cameras.pose[test], off.cameras.pose[test])
+    ahead = exact.cameras.position + 3 * exact.cameras.forward
+    away = torch.stack([off.cameras[i].project(ahead[i : i + 1])[0][0] - 32 for i in train.tolist()])
+    assert 2 < float(away.norm(dim=-1).square().mean().sqrt()) < 4
+    torch.testing.assert_close(off.about["true_pose"][train].float(), exact.cameras.pose[train], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("holes", "kept"), [("grid", 0.25), ("columns", 2 / 3), ("far", 0.5)])
+def test_depth_has_the_holes_that_are_asked_for(holes, kept):
+    room = "room,depth,size=48,views=4"
+    plain, pierced = (nuisance(text, room).photograph(2, ("depth",)).extra["depth"] for text in ("", f"holes={holes}"))
+    known, left = plain.isfinite(), pierced.isfinite()
+    assert (known | ~left).all() and torch.equal(pierced[left], plain[left])
+    assert float(left.sum() / known.sum()) == pytest.approx(kept, abs=0.03)
+
+
+def test_depth_is_as_wrong_as_asked():
+    room = "room,depth,size=48,views=4"
+    plain, scaled, steps, returns = (
+        nuisance(text, room).photograph(2, ("depth",)).extra["depth"]
+        for text in ("", "noise=scaled", "noise=quantised", "noise=returns")
+    )
+    known = plain.isfinite()
+    torch.testing.assert_close(scaled[known], 1.05 * plain[known], atol=1e-3, rtol=1e-3)
+    assert len(steps[steps.isfinite()].unique()) < len(plain[known].unique()) and not torch.equal(steps, plain)
+    assert 0.05 < float((returns[known] != plain[known]).float().mean()) < 0.15
+
+
+def test_a_background_goes_with_the_camera_on_a_turntable():
+    """Its border differs less between photographs than that of a background that stays."""
+    turned, still = nuisance("turntable"), nuisance("open=3")
+    borders = [torch.stack([x.photograph(i).rgb[0] for i in x.splits["train"].tolist()]) for x in (turned, still)]
+    spread = [float(border.std(0).mean()) for border in borders]
+    assert spread[0] < 0.7 * spread[1]  # its light alone changes
+
+
+def test_labels_are_wrong_in_places_and_missing_in_photographs():
+    plain, wrong = nuisance(""), nuisance("labels=40", "still-life,size=16,views=12")
+    assert len(plain.layers["labels"]) == len(plain) and len(wrong.layers["labels"]) < len(wrong)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("still-life,scale=big", "scale must be a number; got 'big'"),
+        ("still-life,scale=nan", "scale is nan, and should be from"),
+        ("still-life,holes=many", "should be  or grid or columns"),
+        ("jelly,shape=2", "this one changes; leave shape out"),
+        ("blocks,scale=2", "a block world has one unit"),
+    ],
+)
+def test_a_nuisance_that_cannot_be_is_refused(text, sentence):
+    with pytest.raises(LumigraphError, match=sentence):
+        open_scene(f"procedural:{text}")
+
+
+def test_a_tail_has_as_many_bones_as_asked():
+    scene = open_scene("procedural:tail,joints=40,size=16,views=4")
+    assert len(scene.frame.skeleton.names) == 40
+    assert open_scene("procedural:tail,joints=2,clips=1,size=16,views=4").frame.skeleton.parents == (-1, 0)

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -22,11 +23,12 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.shapes import Shapes
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.evaluation.baseline import Baselines, below, in_hull
 from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.report import write_report
 from lumigraph.evaluation.run import evaluate_collection, evaluate_on, evaluate_run, joined_shapes
-from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation, evaluate_shapes
+from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation, compare_shapes, evaluate_shapes
 from lumigraph.evaluation.views import evaluate
 from lumigraph.lab.benchmark.cell import Cell, CellSettings
 from lumigraph.lab.benchmark.conduct import conduct
@@ -245,3 +247,40 @@ def test_a_run_without_any_figure_has_a_report(tmp_path):
     for step in range(1, 6):
         run.log({"step": step, "seconds": 0.1 * step, "terms": {}, "statistics": {"rays": math.pi}})
     assert "<h2>Curves" not in write_report(run).read_text()
+
+
+# Trivial baselines
+
+
+def test_a_method_that_shows_less_than_the_nearest_photograph_says_so(tmp_path):
+    scene = tiny.scene()
+    run = tiny.new_run(tmp_path / "run")
+    fit(fresh := run.new_method(CPU), scene, run, steps=1, show=False)
+    with pytest.warns(LumigraphWarning, match="photograph alone, which needs no training"):
+        result = evaluate_run(run, fresh.eval(), scene)
+    fit(learnt := run.new_method(CPU), scene, run, steps=300, show=False)
+    assert set(result["baselines"]) == {"mean photograph", "nearest photograph"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", LumigraphWarning)
+        evaluate_run(run, learnt.eval(), scene, EvaluationOptions())
+
+
+def test_baselines_are_made_of_training_photographs_alone():
+    scene = tiny.scene()
+    stand_ins, held_out = Baselines(scene), int(scene.splits["test"][1])
+    found = stand_ins.of(held_out, (tiny.SIZE, tiny.SIZE))
+    pictures = [scene.photograph(i).before(scene.frame.background) for i in scene.splits["train"].tolist()]
+    torch.testing.assert_close(found["mean photograph"], torch.stack(pictures).mean(0))
+    distance = (scene.cameras.position[scene.splits["train"]] - scene.cameras.position[held_out]).norm(dim=-1)
+    assert torch.equal(found["nearest photograph"], pictures[int(distance.argmin())])
+    assert stand_ins.of(held_out, (12, 6))["nearest photograph"].shape == (12, 6, 3)
+
+
+def test_a_hull_is_the_baseline_of_a_shape():
+    points = torch.tensor([[0.0, 0, 0], [0.95, 0, 0], [0.6, 0.6, 0.6]])
+    inside = in_hull(tiny_shapes.ball().mesh.vertices, points)
+    assert inside is not None and inside.tolist() == [True, False, False]
+    assert in_hull(np.zeros((5, 3)), points) is None
+    score = compare_shapes(tiny_shapes.ball(), tiny_shapes.box(), object(), 500)
+    assert score.baselines["convex hull"] > 0.95 > (score.iou or 0)
+    assert below("run", "IoU", score.iou or 0, score.baselines) and not below("run", "IoU", 1.0, score.baselines)

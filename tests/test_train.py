@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 
 import pytest
 import tiny
 import torch
 from budgets import budget
 
+from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation.views import evaluate
 from lumigraph.run import Run
@@ -98,6 +100,16 @@ def test_another_seed_gives_another_result(tmp_path):
         fit(method, scene, steps=5, seed=seed, show=False)
         results.append(method.logits.detach().clone())
     assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
+
+
+def test_a_config_seed_reaches_the_numbers_that_a_method_draws():
+    """PyTorch's CPU generator reads 32 bits of a seed."""
+    kind, frame = methods.find("instant-ngp"), tiny.scene().frame
+    drawn = []
+    for seed in (0, 1, 2, (1 << 32) - 1):
+        method = kind(frame, replace(kind.smallest(), seed=seed))
+        drawn += [torch.rand(4, generator=method.random(number)) for number in (0, 7, 1_000_000)]
+    assert len({tuple(numbers.tolist()) for numbers in drawn}) == len(drawn)
 
 
 def test_training_leaves_the_global_random_numbers_alone():

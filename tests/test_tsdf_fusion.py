@@ -14,7 +14,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, OpenCV, Pinhole
 from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.images import Layer
-from lumigraph.depth_maps import DepthMap, VoxelBlocks, sensor_faults, trust_of
+from lumigraph.depth_maps import DepthMap, VoxelBlocks, release_weight, sensor_faults, trust_of
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels.block_hash import EMPTY, PRIMES
 from lumigraph.kernels.block_surface import triangles
@@ -90,6 +90,69 @@ def test_a_mean_follows_the_weights():
     vertices, _, _ = volume.surface()
     assert float(vertices[:, 2].median()) == pytest.approx(1.015, abs=5e-4)
     assert len(volume.surface(min_weight=4.5)[0]) == 0
+
+
+def every_third(height: int, width: int) -> torch.Tensor:
+    return (torch.arange(width) % 3 != 1).expand(height, width)
+
+
+def pinholes(height: int, width: int) -> torch.Tensor:
+    """Depth that is registered to the colours of a finer camera: a quarter is known, in a grid."""
+    return (torch.arange(height)[:, None] % 2 == 1) & (torch.arange(width) % 2 == 1)
+
+
+@pytest.mark.parametrize("unknown", [0.0, torch.nan, torch.inf])
+@pytest.mark.parametrize("holes", [every_third, pinholes])
+def test_holes_beside_known_depth_lose_no_surface(holes, unknown):
+    """The wall is as large with holes as without, and as flat: each voxel takes the nearest known pixel."""
+    lens = Pinhole(torch.tensor([[240.0, 240.0]]), torch.tensor([[160.0, 120.0]]))
+    camera, areas = Camera(POSE, lens, torch.tensor([[320, 240]])), []
+    for kept in (None, holes):
+        volume, seen = VoxelBlocks(0.02, 4), depth_map(camera, wall)
+        if kept is not None:
+            depth = torch.where(kept(*seen.depth.shape), seen.depth, unknown)
+            seen = DepthMap.measured(camera, depth, seen.rgb)
+        volume.fuse(seen, trust_of(seen, 0.0, 9.0))
+        vertices, _, faces = volume.surface()
+        a, b, c = vertices[faces].unbind(1)
+        areas.append(float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()))
+        assert float((vertices[:, 2] - 1).abs().median()) < 0.002 and float((vertices[:, 2] - 1).abs().max()) < 0.02
+    assert areas[1] > 0.9 * areas[0]
+
+
+def test_a_point_beside_a_hole_is_compared_with_the_nearest_pixel():
+    camera = camera_of("pinhole")
+    seen = depth_map(camera, wall)
+    pixels = camera.pixels() + 0.3
+    rays = camera.rays(pixels)
+    points = rays.at(1 / rays.directions[:, 2])
+    whole = seen.compare(points)
+    kept = every_third(*seen.depth.shape)
+    holed = replace(seen, depth=torch.where(kept, seen.depth, torch.nan)).compare(points)
+    known = kept.flatten() & whole.ahead.isfinite()
+    assert holed.smooth[known].all() and float(holed.ahead[known].abs().max()) < 0.02
+    assert holed.ahead[~kept.flatten()].isnan().all()
+
+
+def test_weight_and_truncation_are_the_releases():
+    """VoxelHashing: max(3 * 1.5 (1 - (z - 0.4) / 3.6), 1), z along the axis; a truncation of 2 cm + 1 cm a metre."""
+    frame = tiny.scene().frame
+    method, camera = (
+        TSDFFusion(frame, Config(voxel_size=0.02, truncation=2.0, truncation_growth=0.1)),
+        camera_of("pinhole"),
+    )
+    method._fuse(depth_map(camera, wall))
+    at_wall = 4.5 * (1 - (1 - 0.4) / 3.6)
+    volume = method.volume
+    seen = volume.voxels[..., 1] > 0
+    torch.testing.assert_close(volume.voxels[..., 1][seen], torch.full((int(seen.sum()),), at_wall))
+    distance = volume.voxels[..., 0][seen]
+    assert float(distance.min()) < -2.5 and float(distance.min()) >= -(1 + 0.1 * 1.21 / 0.04)
+    far = depth_map(camera, lambda d: 3.2 * wall(d))
+    assert (
+        not release_weight(far, 1.0, 3.0, (0.4, 4.0), 3.0)[30, 40]
+        and release_weight(far, 1.0, 3.0, (0.4, 4.0), 9.0).min() == 1
+    )
 
 
 def test_the_table_has_the_papers_hash():

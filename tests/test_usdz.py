@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import sys
 import zipfile
 
 import numpy as np
@@ -28,19 +29,25 @@ def cone() -> Mesh:
     return Mesh(np.asarray(solid.vertices) @ turn.T + [30, -20, 10], np.asarray(solid.faces), colours)
 
 
-def test_files_lie_as_they_are_at_multiples_of_64_bytes(cone, tmp_path):
+@pytest.mark.parametrize("binary", [False, True])
+def test_files_lie_as_they_are_at_multiples_of_64_bytes(cone, tmp_path, monkeypatch, binary):
+    """The root is binary with OpenUSD's library, else text."""
+    if binary:
+        pytest.importorskip("pxr.Sdf")
+    else:
+        monkeypatch.setitem(sys.modules, "pxr", None)
     write_mesh(tmp_path / "cone.usdz", cone, UP)
     data = (tmp_path / "cone.usdz").read_bytes()
     with zipfile.ZipFile(io.BytesIO(data)) as packed:
         assert packed.testzip() is None
         layer, picture = packed.infolist()
-        assert layer.filename.endswith(".usda") and picture.filename.endswith(".png")
+        assert layer.filename == f"scene.usd{'ac'[binary]}" and picture.filename.endswith(".png")
         for entry in (layer, picture):
             name, extra = struct.unpack("<HH", data[entry.header_offset + 26 : entry.header_offset + 30])
             assert entry.compress_type == zipfile.ZIP_STORED
             assert (entry.header_offset + 30 + name + extra) % ALIGNMENT_BYTES == 0
-        text = packed.read(layer).decode()
-        assert text.startswith("#usda 1.0") and 'upAxis = "Y"' in text and f"@{picture.filename}@" in text
+        data = packed.read(layer)
+        assert data.startswith(b"PXR-USDC" if binary else b"#usda 1.0")
     assert names(tmp_path) == ["cone.usdz"]
 
 

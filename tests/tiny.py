@@ -103,6 +103,22 @@ def made(count: int, size: int, focal: float) -> Scene:
     return Scene(cameras, images, frame, splits, names, "in memory", layers={"depth": depth})
 
 
+@cache
+def stranger() -> Scene:
+    """A scene that no method is developed with: three photographs in different light before an opaque far background;
+    depth with two of three columns unknown."""
+    known, random = scene(), np.random.default_rng(0)
+    gains = random.uniform(0.4, 1.2, 3)
+    pictures = [(known.images[i].numpy()[..., :3] * np.roll(gains, i % 3)).astype(np.uint8) for i in range(len(known))]
+    images = ImageStore.from_arrays(pictures)
+    holes = np.where(np.arange(SIZE) % 3 == 1, 1.0, np.nan).astype(np.float32)
+    planes = [LayerSource(partial(lambda p: ball(p)[0].numpy() * holes, p)) for p in known.cameras.pose]
+    depth = Layer(images, planes, np.dtype(np.float32), 1, "distance")
+    frame = replace(known.frame, has_alpha=False, background=(0.0, 0.0, 0.0), reach=64.0, near=0.01, train_count=3)
+    splits = known.splits | {"train": known.splits["train"][[0, 4, 8]]}
+    return replace(known, images=images, frame=frame, splits=splits, layers={"depth": depth})
+
+
 def method(frame: Frame | None = None, seed: int = 0, **config):
     kind = lumigraph.methods.find("voxel-grid")
     return build(kind, frame or scene().frame, kind.Config(**config), torch.device("cpu"), seed)

@@ -25,6 +25,7 @@ from ..files.names import counted, natural
 from ..readers.masks import MASKS
 from ..readers.numbers import check_pixels
 from ..readers.pictures import reads_heic
+from ..readers.profiles import colours_of
 from ..readers.raw import is_raw
 from ..sfm.photos.film import VIDEOS
 from ..sfm.photos.gather import PHOTOGRAPHS, walk
@@ -158,7 +159,7 @@ def _thumbnail(path: Path, modified: int, size: int, side: int) -> bytes:
             image = first_frame(path)
         else:
             with opened(path) as whole:
-                image = ImageOps.exif_transpose(reduced(whole, side))
+                image = ImageOps.exif_transpose(colours_of(whole).to_srgb(reduced(whole, side)))
         image.thumbnail((side, side))
         out = io.BytesIO()
         image.save(out, "JPEG", quality=80, comment="")  # Pillow would keep the photograph's

@@ -44,10 +44,11 @@ def rgb(image: Image.Image) -> Image.Image:
 
 
 def jpeg_of(image: Image.Image, side: int) -> bytes:
-    """JPEG of an image, reduced, which keeps its orientation as stored."""
+    """JPEG of an image, reduced, which keeps its orientation as stored and its profile."""
     exif = Image.Exif()
     exif[ORIENTATION] = image.getexif().get(ORIENTATION, 1)
-    reduced(image, side).save(out := io.BytesIO(), "JPEG", quality=QUALITY, exif=exif)
+    profile = image.info.get("icc_profile") if image.mode.startswith("RGB") else None
+    reduced(image, side).save(out := io.BytesIO(), "JPEG", quality=QUALITY, exif=exif, icc_profile=profile)
     return out.getvalue()
 
 

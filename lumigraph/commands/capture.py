@@ -32,8 +32,8 @@ class CaptureCommand(MotionOptions, Output):
     output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
     """Folder for the scene."""
     mask_object: bool = False
-    """Mask one object in front of a backdrop, so that training learns it alone. Writes object_masks/ and object.png
-    into the scene; check that picture before you train."""
+    """Mask one object in front of a backdrop, so that training learns it alone. Always done where the object was turned
+    before a background at rest. Writes object_masks/ and object.png into the scene; check that picture."""
 
     def run(self) -> int:
         from ..sfm.rig import capture_recorded, capture_rig, is_recorded, is_rig
@@ -56,28 +56,42 @@ class CaptureCommand(MotionOptions, Output):
                 say(f"warning: {sentence}")
             return 0
         onward = typed("train", "deformable-splatting" if self.moving else "gaussian-splatting", folder)
-        show_result(folder, find_cameras(self.what, folder, self), None if self.mask_object else onward)
-        if self.mask_object:
-            show_masks(folder, onward)
+        show_all(folder, find_cameras(self.what, folder, self), onward, self.mask_object)
         return 0
 
 
-def show_masks(folder: Path, onward: str) -> None:
+def show_all(folder: Path, result: dict[str, Any], onward: str | None = None, masked: bool = False) -> None:
+    """Print the result, and mask the object if asked or if it was turned before a background at rest."""
+    from ..sfm.doctor import TURNING
+
+    turned = any(finding["fault"] == TURNING for finding in result["findings"])
+    show_result(folder, result, None if masked or turned else onward)
+    try:
+        if masked or turned:
+            show_masks(folder, onward)
+    except LumigraphError as error:
+        if masked:
+            raise
+        show({"next": onward} if onward else {})
+        say(f"warning: {error}")
+
+
+def show_masks(folder: Path, onward: str | None) -> None:
     """Find the object of a scene, unless that was done before: results to stdout, doubts to stderr."""
     from ..readers import choose_reader
     from ..readers.masks import OBJECT_MASKS
     from ..readers.objects import mask_object
 
     if (folder / OBJECT_MASKS).exists():
-        show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
+        as_they_are = f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew"
+        show({"masks": as_they_are} | ({"next": onward} if onward else {}))
         return
     masked = mask_object(folder, choose_reader(folder).read(folder))
     found = {
         "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
         "look at": f"{masked.sheet}: bright is the object, dark is masked",
-        "next": onward,
     }
-    show(found)
+    show(found | ({"next": onward} if onward else {}))
     for doubt in masked.doubts:
         say(f"warning: {doubt}; look at {masked.sheet}, and correct or delete {folder / OBJECT_MASKS}")
 
@@ -92,7 +106,7 @@ def posed(scene: str) -> str:
         return scene
     folder = scene_folder((path,))
     say(f"{scene} holds no poses; finding them, to {folder}")
-    show_result(folder, find_cameras((path,), folder))
+    show_all(folder, find_cameras((path,), folder))
     return str(folder)
 
 

@@ -43,7 +43,7 @@ class Files:
     def check(self) -> None:
         """Raises LumigraphError for an output with another ending."""
         if self.endings and self.output.suffix.lower() not in self.endings:
-            raise LumigraphError(f"{self.output} should end in {self.endings[0]}; rename it")
+            raise LumigraphError(f"{self.output} should end in {', '.join(self.endings)}; rename it")
 
 
 @dataclass(frozen=True)
@@ -213,18 +213,19 @@ class ExportPoints(Reports, Loading, PointsOptions, Files):
     """
 
     output: Annotated[Positional[Path], needed("FILE.ply")]
-    """The new file."""
-    endings = (".ply",)
+    """The new file; .las and .laz, of surveyors, hold integers beside a scale and an offset."""
+    endings = (".ply", ".las", ".laz")
 
     def of(self, opened: Any) -> Exported:
         from ..export.points import export_points, write_points
 
         claim(self.output, "points", self.overwrite, [self.source])
         points = export_points(self.loaded(opened), self)
-        write_points(self.output, points, opened.frame.origin if self.origin else None)
+        told = self.origin and self.output.suffix.lower() == ".ply"
+        write_points(self.output, points, opened.frame.origin if told else None)
         count = len(points.positions)
         rows = {"file": str(self.output), "points": f"{count:,}", "size": size_text(self.output)}
-        return Exported(self.output, {"points": count}, rows=rows | place_row(opened.frame, self.origin))
+        return Exported(self.output, {"points": count}, rows=rows | place_row(opened.frame, told))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import statistics
+import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
@@ -10,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 from ..budget import QUALITIES, Budget
 from ..datasets.scene import Scene
 from ..datasets.world import BlockWorld
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..method import Method, RayMethod
 from .common import finding_rows, say, show, typed
 
 if TYPE_CHECKING:
     from ..evaluation.photographs import Examined
+    from ..sfm.doctor import Residual
 
 SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
 FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
@@ -64,8 +67,10 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
     learnt, held_out = ([one.psnr for one in checked.of(split)] for split in ("train", "test"))
     if learnt and held_out and not method.moves_cameras:  # poses of held-out photographs are not learnt
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
-        rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
+        beside = "" if method.complete else f", training photographs {psnr:.1f} dB"  # it shows these themselves
+        rows["held-out photographs"] = f"{other:.1f} dB{beside} ({ABOUT_RESIDUALS})"
         gap = psnr - other
+        warn_below(run, method, checked.of("test"))
     if not method.complete:
         rows["advice"] = advice(trend, enough, more, photographed(run, data))
     if enough and not method.complete and gap > MEMORISED_DB:
@@ -77,7 +82,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
 
 def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
     """Write the trajectory of a run and print its errors, lost frames and next commands."""
-    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
+    from ..evaluation.tracking import DRIFT_FILE, PATH_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
 
     state, sequence = outcome.state, method.tracker.sequence(data)
     followed = min(state.step, len(sequence))
@@ -92,6 +97,7 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     if not outcome.finished:
         say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
     rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
+    rows |= {"path": str(run.folder / PATH_FILE)} if found.map else {}
     if found.lost:
         names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
         more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""
@@ -116,6 +122,17 @@ def examined(run: Any, method: Method, data: Any, turn: Any) -> Examined:
     except LumigraphError as fault:
         say(f"warning: the photographs could not be examined: {fault}")
         return Examined()
+
+
+def warn_below(run: Any, method: Method, held_out: Sequence[Residual]) -> None:
+    """Warn where renderings of held-out photographs are worse than trivial stand-ins."""
+    from ..evaluation.baseline import below
+
+    means = {name: statistics.fmean(one.baselines[name] for one in held_out) for name in held_out[0].baselines}
+    if sentence := below(
+        run.folder, "dB at held-out photographs", statistics.fmean(one.psnr for one in held_out), means
+    ):
+        warnings.warn(sentence, LumigraphWarning, stacklevel=2)
 
 
 def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str:

@@ -25,7 +25,8 @@ class Track(ViewerOptions, TrackOptions, Output):
 
     RECORDING is a folder of colour and depth, or procedural:room,depth. Poses in it are used for errors alone. RUN is
     an ordinary run (`view`, `render`, `eval`, `export mesh`), and trajectory.txt has the pose of each frame in TUM's
-    format. tracking.json has ATE and RPE as evo defines them, drift.svg shows the error along the path. Ctrl-C saves;
+    format. tracking.json has ATE and RPE as evo defines them, path.svg shows the path with its loops, drift.svg the
+    error along it. Ctrl-C saves;
     `lumigraph resume` continues. `lumigraph track METHOD --help` adds the method's own options.
     """
 

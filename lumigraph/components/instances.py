@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import warnings
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..datasets.images import LayerSource
 from ..datasets.scene import Scene
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import Similarity
 from ..method.controls import Configured, Control
 
 LABELS = "labels"
+BESIDE = "beside"  # layer of `with_beside`
+BESIDE_REACH = 0.2  # share of a photograph's longer side, within which another label is beside a pixel
+MIN_LABEL_VIEWS = 4  # photographs that should show an instance
 MOVE, COPY, REMOVE, ALONE = EDITS = "move", "copy", "remove", "alone"
 AXES = "x", "y", "z"
 CONTROLS = {"edit", "turn", *(f"shift_{axis}" for axis in AXES)}
 SHIFT, TURN = (f"{change} of what is moved or copied" for change in ("Shift", "Rotation"))
 NOT_AN_INSTANCE = -1  # label of pixels that show no object, or an unknown one
-MAX_LABEL = 255  # the largest label that names an instance
 OPAQUE_ALPHA = 0.5
 
 
@@ -90,6 +97,48 @@ def check_labels(scene: Scene) -> None:
         )
     if LABELS in scene.layers and not len(scene.layers[LABELS]):
         raise LumigraphError(f"No label picture of {scene.source} matches a photograph; name each after its photograph")
+    if LABELS in scene.layers:
+        warn_of_few_views(scene)
+
+
+def warn_of_few_views(scene: Scene) -> None:
+    """Warn of labels that hardly any training photograph shows."""
+    layer, train = scene.layers[LABELS], scene.splits["train"].tolist()
+    views = Counter[int](
+        x for i in train if layer.planes[i] for x in np.unique(layer.stored(i)[layer.known(layer.stored(i))]).tolist()
+    )
+    few = [label for label, count in sorted(views.items()) if count < MIN_LABEL_VIEWS]
+    if few:
+        warnings.warn(
+            f"Of {len(train)} photographs hardly any shows the objects of labels {', '.join(map(str, few))}; an object "
+            f"that fewer than {MIN_LABEL_VIEWS} show is not told from what is around it, so label more photographs",
+            LumigraphWarning,
+            stacklevel=3,
+        )
+
+
+def with_beside(scene: Scene) -> Scene:
+    """The scene with a layer of the label at a random place near each pixel. A pixel beside a mask thus meets that mask
+    as often as the mask's pixels meet it: the closer and the larger, the more often. Labelled photographs are repeated
+    in the training split, where they are few, to make up about half of it. Without labels, the scene."""
+    if LABELS not in scene.layers:
+        return scene
+    layer = scene.layers[LABELS]
+
+    def beside(image: int) -> np.ndarray:
+        stored, chance = layer.stored(image), np.random.default_rng(image)
+        shape = np.array(stored.shape[:2])
+        angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * shape.max() * chance.random(shape) ** 2
+        moved = np.indices(shape) + np.rint(away * np.stack([np.sin(angle), np.cos(angle)])).astype(int)
+        row, column = np.clip(moved, 0, (shape - 1)[:, None, None])
+        return stored[row, column]
+
+    planes = [plane and LayerSource(partial(beside, image)) for image, plane in enumerate(layer.planes)]
+    train = scene.splits["train"]
+    labelled = train[[layer.planes[i] is not None for i in train.tolist()]]
+    repeated = labelled.repeat(max(len(train) // max(len(labelled), 1) - 1, 0))
+    splits = scene.splits | {"train": torch.cat([train, repeated])}
+    return replace(scene, splits=splits, layers=scene.layers | {BESIDE: layer.like(scene.images, planes)})
 
 
 def labels_of(

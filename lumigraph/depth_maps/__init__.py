@@ -19,6 +19,7 @@ from .depth_map import hidden as hidden
 from .depth_map import measurements as measurements
 from .depth_map import render_depth_maps as render_depth_maps
 from .depth_map import surface_points as surface_points
+from .sensor import release_weight as release_weight
 from .sensor import sensor_faults as sensor_faults
 from .sensor import trust_of as trust_of
 from .voxel_blocks import VoxelBlocks as VoxelBlocks

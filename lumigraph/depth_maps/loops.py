@@ -15,20 +15,25 @@ from numba import njit, prange
 
 @njit(inline="always")
 def depth_at(depth, x, y, edge):
-    """Bilinear depth between pixels' centres, and True; at a depth edge, where the four differ by `edge`, the nearest
-    pixel's and False. NaN and False where one of them is NaN."""
+    """Bilinear depth between pixel centres, and True; where one of the four is NaN, that of the pixel at (x, y), which
+    may be NaN. At a depth edge, where the known ones differ by `edge`, the least and False."""
     height, width = depth.shape
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     left, top = int(u), int(v)
     right, below = min(left + 1, width - 1), min(top + 1, height - 1)
     a, b, c, d = depth[top, left], depth[top, right], depth[below, left], depth[below, right]
-    if math.isnan(a + b + c + d):
-        return a + b + c + d, False
-    nearest = min(a, b, c, d)
+    own, whole = depth[int(y), int(x)], not math.isnan(a + b + c + d)
+    if math.isnan(own):
+        return own, False
+    nearest, farthest = own, own
+    for value in (a, b, c, d):  # NaN is neither less nor more
+        nearest, farthest = value if value < nearest else nearest, value if value > farthest else farthest
     if nearest == math.inf:
         return nearest, True
-    if max(a, b, c, d) - nearest >= edge:
+    if farthest - nearest >= edge:
         return nearest, False
+    if not whole:
+        return own, True
     u, v = u - left, v - top
     return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d), True
 
@@ -65,10 +70,24 @@ def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, w
                 truncated[i] += share * truncation
 
 
+@njit(inline="always")
+def known_step(depth, y, x, dy, dx, reach):
+    """Steps to the next known pixel along a direction, at most `reach`, and the difference of its depth; 0, infinity
+    without one."""
+    height, width = depth.shape
+    for k in range(1, reach + 1):
+        row, column = y + k * dy, x + k * dx
+        if not (0 <= row < height and 0 <= column < width):
+            break
+        if depth[row, column] > 0 and depth[row, column] < math.inf:
+            return k, abs(depth[row, column] - depth[y, x])
+    return 0, math.inf
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
-def incidence(depth, directions, out):
-    """Cosine between each pixel's ray and its surface normal, from differences to the nearer of two neighbours along
-    each axis; 0 for unknown depth of the pixel or of both neighbours.
+def incidence(depth, directions, reach, out):
+    """Cosine between each pixel's ray and its surface normal, from differences to the nearer in depth of two known
+    pixels along each axis; 0 for unknown depth of the pixel, or of all within `reach` of it along an axis.
 
     directions: (height, width, 3), unit length
     """
@@ -78,23 +97,22 @@ def incidence(depth, directions, out):
             here, out[y, x] = depth[y, x], 0.0
             if not (here > 0 and here < math.inf):
                 continue
-            left, right = depth[y, max(x - 1, 0)], depth[y, min(x + 1, width - 1)]
-            above, below = depth[max(y - 1, 0), x], depth[min(y + 1, height - 1), x]
-            # Comparisons with NaN are false, so a neighbour that is not known is not the nearer one.
-            along_x = 1 if x + 1 < width and not (x > 0 and abs(left - here) <= abs(right - here)) else -1
-            along_x = -1 if x > 0 and not abs(right - here) < math.inf else along_x
-            along_y = 1 if y + 1 < height and not (y > 0 and abs(above - here) <= abs(below - here)) else -1
-            along_y = -1 if y > 0 and not abs(below - here) < math.inf else along_y
-            beside, under = depth[y, x + along_x], depth[y + along_y, x]
-            if not (beside > 0 and beside < math.inf and under > 0 and under < math.inf):
+            left, from_left = known_step(depth, y, x, 0, -1, reach)
+            right, from_right = known_step(depth, y, x, 0, 1, reach)
+            above, from_above = known_step(depth, y, x, -1, 0, reach)
+            under, from_under = known_step(depth, y, x, 1, 0, reach)
+            along_x = -left if from_left <= from_right else right
+            along_y = -above if from_above <= from_under else under
+            if along_x == 0 or along_y == 0:
                 continue
+            beside, below = depth[y, x + along_x], depth[y + along_y, x]
             dx, dy, dz = directions[y, x, 0], directions[y, x, 1], directions[y, x, 2]
             ax = beside * directions[y, x + along_x, 0] - here * dx
             ay = beside * directions[y, x + along_x, 1] - here * dy
             az = beside * directions[y, x + along_x, 2] - here * dz
-            bx = under * directions[y + along_y, x, 0] - here * dx
-            by = under * directions[y + along_y, x, 1] - here * dy
-            bz = under * directions[y + along_y, x, 2] - here * dz
+            bx = below * directions[y + along_y, x, 0] - here * dx
+            by = below * directions[y + along_y, x, 1] - here * dy
+            bz = below * directions[y + along_y, x, 2] - here * dz
             nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             if length > 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from torch.nn.functional import normalize
 from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..datasets.scene import Scene
+from ..errors import LumigraphWarning
 from ..geometry import evenly
 from ..system.progress import track
 from .depth_map import DepthMap
@@ -64,7 +66,7 @@ def multi_view_depth(
     """Depth maps of training photographs, through ideal pinholes; NaN where neighbours do not agree.
 
     size:    pixels along the longer side of the maps, about
-    seconds: time for matching, about; maps are smaller, and of fewer photographs, if it would take longer
+    seconds: time for matching, about; if it would take longer, maps are smaller and of fewer photographs, and it warns
     views:   largest number of photographs, spread evenly
     Depths are searched around the scene's sparse points, or without any around those of the coarsest level. The
     cameras' `image_index` is the photograph's number.
@@ -120,7 +122,7 @@ def match(
     photographs: number of each view's photograph; pyramids: its picture at each of the first levels; spans: of its
                  depths
     """
-    chance, begin, taken = torch.Generator().manual_seed(0), time.perf_counter(), 0.0
+    chance, begin, taken, count = torch.Generator().manual_seed(0), time.perf_counter(), 0.0, len(pyramids)
     if seconds < math.inf:
         some = evenly(list(range(len(pyramids))), affordable([one[0] for one in pyramids], spans, seconds))
         photographs, pyramids = [photographs[i] for i in some], [pyramids[i] for i in some]
@@ -141,6 +143,14 @@ def match(
                 if neighbours[i] and iterations:
                     improve(maps, i, neighbours[i], level, geometric, iterations, chance)
         taken = time.perf_counter() - begin - spent
+    reached, full = (max(view.trust.shape) for view in (maps[0].view, pyramids[0][-1]))
+    if reached < full or len(maps) < count and len(pyramids[0]) > 1:
+        warnings.warn(
+            f"Stereo had time for depth maps of {reached} of {full} pixels, of {len(maps)} of {count} photographs, so "
+            "depth is coarse; give it more --seconds",
+            LumigraphWarning,
+            stacklevel=4,
+        )
     sure = [agreed(maps, i, neighbours[i]) for i in range(len(maps))]
     return [depth_map(*one) for one in zip(maps, sure, photographs, strict=True)]
 

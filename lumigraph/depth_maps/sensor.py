@@ -17,6 +17,7 @@ from ..geometry import evenly
 from . import loops
 from .depth_map import DepthMap
 
+REACH = 4  # pixels to the next known one, of which a normal is made: depth that is registered to colours has holes
 MIN_FACING = 0.1  # cosine between ray and normal below which a pixel is not trusted
 CHECKED_VIEWS = 8  # depth maps that are looked at
 MAX_ROOM = 100.0  # metres, units of the capture: sensors measure less
@@ -34,11 +35,26 @@ def trust_of(seen: DepthMap, trusted: float, farthest: float) -> Float[Tensor, "
     depth, facing = seen.depth.contiguous(), torch.empty_like(seen.depth)
     width, height = seen.camera.size[0].tolist()
     towards = directions(json.dumps(seen.camera.lens.to_json()), width, height)
-    loops.incidence(depth.numpy(), towards.numpy(), facing.numpy())
+    loops.incidence(depth.numpy(), towards.numpy(), REACH, facing.numpy())
     weight = torch.where((facing > MIN_FACING) & (depth < farthest), facing, 0.0)
     if trusted > 0:
         weight = weight * (trusted / depth.nan_to_num(math.inf).clamp_min(1e-9)).clamp(max=1).pow(4)
     return weight.nan_to_num(0.0, 0.0)
+
+
+def release_weight(
+    seen: DepthMap, unit: float, sample: float, span: tuple[float, float], farthest: float
+) -> Float[Tensor, "height width"]:
+    """Weight of each pixel in the program of VoxelHashing, by its depth z along the axis; 0 beyond `farthest`.
+
+        w = max(1.5 sample (1 - (z - near) / (far - near)), 1)
+
+    unit: scene units of a metre; span: near and far, metres; farthest: metres
+    """
+    width, height = seen.camera.size[0].tolist()
+    along = directions(json.dumps(seen.camera.lens.to_json()), width, height)[..., 2] * seen.depth / unit
+    weight = (1.5 * sample * (1 - (along - span[0]) / (span[1] - span[0]))).clamp_min(1)
+    return torch.where((along > 0) & (along < farthest), weight, 0.0)
 
 
 @lru_cache(maxsize=4)

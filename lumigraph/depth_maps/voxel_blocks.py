@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor, nn
+from torch.nn.functional import max_pool2d
 
 from .. import kernels
 from ..camera.rays import Rays
@@ -38,9 +39,18 @@ class VoxelBlocks(nn.Module):
     voxels: Float[Tensor, "block 512 5"]
     table: Int32[Tensor, " slot"]
 
-    def __init__(self, edge: float, truncation: float, max_weight: float = math.inf, max_blocks: int = 1 << 24):
-        """Create an empty field. edge: of a voxel, scene units; truncation: in voxels; max_blocks: limit"""
+    def __init__(
+        self,
+        edge: float,
+        truncation: float,
+        max_weight: float = math.inf,
+        max_blocks: int = 1 << 24,
+        growth: float = 0.0,
+    ):
+        """Create an empty field. edge: of a voxel, scene units; truncation: in voxels; max_blocks: limit; growth: of
+        the truncation, for each unit of depth"""
         super().__init__()
+        self.growth = growth
         self.edge, self.truncation, self.max_weight, self.max_blocks = edge, truncation * edge, max_weight, max_blocks
         self.register_buffer("blocks", torch.empty(0, 3, dtype=torch.int32))
         self.register_buffer("voxels", empty_voxels(0))
@@ -67,22 +77,27 @@ class VoxelBlocks(nn.Module):
             depth, rgb, trusted, pose, lens = (x.contiguous() for x in given)
             depth = torch.where(trusted > 0, depth, torch.nan)
             room = self._add(self._new_blocks(depth, pose, lens)) and room
-            numbers = self.edge, self.truncation, EDGE, self.max_weight
+            numbers = self.edge, self.truncation, EDGE, self.max_weight, self.growth
             kernels.fuse_depth(self.voxels, self.blocks, depth, rgb, trusted, pose, lens, *numbers, in_place=True)
         return room
 
     def _new_blocks(
         self, depth: Float[Tensor, "height width"], pose: Float[Tensor, "3 4"], lens: Float[Tensor, " 4"]
     ) -> Int32[Tensor, "new 3"]:
-        """Missing blocks around surfaces: by rays of pixels, PIXELS_PER_SIDE to a block's side at median depth."""
-        side, known = SIDE * self.edge, depth[::8, ::8].nan_to_num(0.0, 0.0)
-        measured = known[known > 0]
-        typical = float(measured.median()) if measured.numel() else 0.0
+        """Missing blocks around surfaces: by rays of pixels, PIXELS_PER_SIDE to a block's side at median depth. A pixel
+        stands for a square of them: the nearest one where it is unknown itself, so that no pattern of holes hides all.
+        """
+        side, known = SIDE * self.edge, depth[(depth > 0) & (depth < math.inf)][::64]
+        typical, farthest = (float(known.median()), float(known.amax())) if known.numel() else (0.0, 0.0)
         step = int(side * float(lens[:2].min()) / max(PIXELS_PER_SIDE * typical, 1e-9))
         step = min(max(step, 1), MAX_PIXEL_STEP)
         some, numbers = depth[::step, ::step].contiguous(), lens / step
+        if step > 1 and (unknown := ~((some > 0) & (some < math.inf))).any():
+            there = torch.where(depth > 0, -depth, -math.inf)[None]
+            some = torch.where(unknown, -max_pool2d(there, step, ceil_mode=True)[0], some)
+        band = self.truncation + self.growth * farthest
         numbers[2:] += 0.5 - 0.5 / step  # centres of pixels stay where they are
-        return kernels.band_blocks(some, pose, numbers, self.blocks, self.table, side, self.truncation)
+        return kernels.band_blocks(some, pose, numbers, self.blocks, self.table, side, band)
 
     def _add(self, new: Int32[Tensor, "new 3"]) -> bool:
         """Append blocks without observations; False if there is no memory for them."""

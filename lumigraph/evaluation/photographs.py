@@ -24,13 +24,14 @@ from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet
 from ..files import read_json, write_json
 from ..files.ranges import typed
 from ..geometry import evenly
-from ..method import Method
+from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, can, needs
 from ..metrics import psnr
 from ..opening import read_capture
 from ..run import Run
 from ..sfm.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
 from ..system.progress import track
+from .baseline import Baselines
 
 PIXEL_BUDGET = 800_000  # rendered pixels of all photographs together, so that the check takes seconds
 MAX_SECONDS = 10.0  # of rendering; slow methods render smaller, and fewer photographs
@@ -126,6 +127,7 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
         chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
     found: list[Compared] = []
     maps: list[DepthMap] = []
+    stand_ins = Baselines(scene, method.evidence_views)
     for index in track(chosen, "Examining photographs", len(chosen)):
         with turn():
             shot, camera, seen = rendered(method, scene, index, side)
@@ -136,7 +138,9 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
         maps.append(DepthMap.of_rendering(camera, seen, scene.frame.background))
         rgb = seen.rgb.clamp(0, 1)
         straight, mirrored = (fit(rgb[m], image[m]) for image, m in ((truth, mask), (truth.flip(1), mask.flip(1))))
-        residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0)
+        trivial = {} if splits[index] == "train" else stand_ins.of(index, (truth.shape[0], truth.shape[1]))
+        others = {name: fit(picture[mask], truth[mask]) for name, picture in trivial.items()}
+        residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0, others)
         found.append(Compared(residual, index, side))
     shares = floating(maps)
     return [
@@ -146,15 +150,15 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
 
 def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Photograph, Camera, Rendering]:
     """A photograph reduced to a longer side, its refined camera, and the rendering with its own trained exposure or
-    appearance. Gaussians are rendered at the photograph's size and reduced like it: at small size their low-pass filter
-    would widen them, which costs 3 to 8 dB."""
+    appearance. Whole pictures are rendered at the photograph's size and reduced like it: at small size the low-pass
+    filter of Gaussians would widen them, which costs 3 to 8 dB, and texels of photographs would alias."""
     whole = scene.photograph(index)
     factor = max(1, round(int(whole.camera.size.max()) / side))
     shot = whole.reduced(factor)
     own = {control.name: str(index) for control in method.controls if control.of_photographs}
     method = method.given(**own) if own else method
     camera = method.refined(shot.camera)
-    if factor == 1 or not can(method, HasGaussians):
+    if factor == 1 or isinstance(method, RayMethod):
         return shot, camera, method.render(camera).cpu()
     seen = method.render(method.refined(whole.camera)).cpu()
     layers = {"depth": seen.depth, "opacity": seen.opacity}
@@ -167,13 +171,13 @@ def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[
 
     camera: of one of them, to measure the speed
     """
-    cloud = can(method, HasGaussians)
-    tried = camera if cloud else camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
+    whole = not isinstance(method, RayMethod)
+    tried = camera if whole else camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
     method.render(tried)  # compiles
     begin = time.perf_counter()
     method.render(tried).cpu()  # waits for a GPU
     seconds = time.perf_counter() - begin
-    if cloud:
+    if whole:
         return evenly(chosen, max(MIN_JUDGED, int(MAX_SECONDS / seconds))), MAX_SIDE
     pixels, least = int(tried.size.prod()), int(tried.size.max())
     budget = min(PIXEL_BUDGET, MAX_SECONDS * pixels / seconds)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from PIL import Image
 
 from .. import __version__, methods
 from ..budget import Budget
+from ..color.tags import srgb_bytes
 from ..errors import LumigraphError
 from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
@@ -274,10 +274,8 @@ def plain(value: Any) -> str:
 
 def jpeg(path: Path) -> str:
     """A picture as a JPEG small enough to embed in a page."""
-    file = io.BytesIO()
     with readable(path), Image.open(path) as image:
-        image.convert("RGB").save(file, "JPEG", quality=90, optimize=True)
-    return data_uri(file.getvalue(), "image/jpeg")
+        return data_uri(srgb_bytes(image.convert("RGB"), "JPEG", quality=90, optimize=True), "image/jpeg")
 
 
 def data_uri(data: bytes, kind: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
 from ..datasets.words import Words
 from ..datasets.world import BlockWorld
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..figures import save_picture
 from ..files import claim, refuse_link, scene_name, write_json
 from ..method import Method
@@ -24,6 +25,7 @@ from ..metrics import Score
 from ..metrics.lpips import Lpips, load_lpips, named_files
 from ..run import Trained
 from ..system.progress import counting
+from .baseline import below
 from .options import EvaluationOptions
 from .shapes import ShapesEvaluation, evaluate_shapes
 from .views import ViewsEvaluation, evaluate, file_name, reveal
@@ -104,6 +106,10 @@ def evaluate_run(
     with counting("Drawing the contact sheet"):
         save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title), "evaluation")
     write_json(run.folder / f"{stem(split)}.json", result, "evaluation")
+    for score in found.scores[:1]:
+        unit, baselines = score.unit or score.name, result.get("baselines", {})
+        if sentence := below(run.folder, unit, score.value, baselines, method.complete):
+            warnings.warn(sentence, LumigraphWarning, stacklevel=2)
     return result
 
 

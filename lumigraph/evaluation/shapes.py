@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from ..method.capabilities import HasDistance, HasMesh, can, needs
 from ..metrics import Score, chamfer_distance, intersection_over_union, normal_consistency
 from ..system.progress import track
 from ..system.work import at_work
+from .baseline import in_hull
 from .options import EvaluationOptions
 from .views import reveal
 
@@ -38,7 +39,10 @@ STEPS, TOUCHING_DISTANCE, MAX_OVERSHOOT = 200, 2e-3, 6.0
 
 @dataclass(frozen=True)
 class ShapeScore:
-    """Scores of one shape. iou is None for a point cloud, which has no inside; normals if it has none."""
+    """Scores of one shape. iou is None for a point cloud, which has no inside; normals if it has none.
+
+    baselines: IoU of trivial stand-ins, see `baseline`
+    """
 
     name: str
     chamfer: float
@@ -46,6 +50,7 @@ class ShapeScore:
     completeness: float
     iou: float | None
     normals: float | None
+    baselines: dict[str, float] = field(default_factory=dict)
 
     @property
     def scores(self) -> list[Score]:
@@ -77,6 +82,14 @@ class ShapesEvaluation:
         ]
 
     @property
+    def baselines(self) -> dict[str, float]:
+        """Means of the baselines, where all shapes, or members, have them."""
+        every = [each.baselines for each in self.members or self.shapes]
+        return {
+            name: float(np.mean([one[name] for one in every])) for name in every[0] if all(name in x for x in every)
+        }
+
+    @property
     def compared(self) -> str:
         count = len(self.shapes)
         return f"{count} shape{'' if count == 1 else 's'}"
@@ -84,6 +97,7 @@ class ShapesEvaluation:
     def to_json(self) -> dict[str, Any]:
         return {
             "scores": [score.to_json() for score in self.scores],
+            **({"baselines": self.baselines} if self.baselines else {}),
             "protocol": self.protocol,
             "shapes": [asdict(shape) for shape in self.shapes],
         }
@@ -145,15 +159,17 @@ def compare_shapes(true: Shape, learnt: Shape, method: object, points: int) -> S
     a, b = learnt.surface(points, generator), true.surface(points, generator)
     size = float(np.ptp(true.mesh.vertices, 0).max())
     chamfer, accuracy, completeness = chamfer_distance(a.points, b.points, size)
-    iou = normals = None
+    iou, normals, baselines = None, None, dict[str, float]()
     if not true.is_cloud:
         low, high = torch.tensor(true.frame.bounds)
         places = low + (high - low) * torch.rand(points, 3, generator=generator)
         inside = distances(method, places) < 0 if can(method, HasDistance) else learnt.inside(places)
-        iou = intersection_over_union(inside, true.inside(places))
+        solid, hull = true.inside(places), in_hull(true.mesh.vertices, places)
+        iou = intersection_over_union(inside, solid)
+        baselines = {} if hull is None else {"convex hull": intersection_over_union(hull, solid)}
     if a.normals is not None and b.normals is not None:
         normals = normal_consistency(a.points, a.normals, b.points, b.normals)
-    return ShapeScore(true.name, chamfer, accuracy, completeness, iou, normals)
+    return ShapeScore(true.name, chamfer, accuracy, completeness, iou, normals, baselines)
 
 
 def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:

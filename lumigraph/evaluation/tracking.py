@@ -18,11 +18,12 @@ from ..figures.charts import Series, line_chart, standalone
 from ..geometry import evenly
 from ..method import Method
 from ..metrics import Score, psnr
-from ..metrics.trajectory import Poses, TrajectoryErrors, position_errors, relative_errors, to_tum
+from ..metrics.trajectory import Poses, TrajectoryErrors, aligned, position_errors, relative_errors, to_tum
 from .held_out_poses import TRUE_POSE
 
 MAPPED_VIEWS = 8  # held-out frames at which a map is compared
-TRAJECTORY_FILE, TRUTH_FILE, ERRORS_FILE, DRIFT_FILE = "trajectory.txt", "truth.txt", "tracking.json", "drift.svg"
+TRAJECTORY_FILE, TRUTH_FILE, ERRORS_FILE = "trajectory.txt", "truth.txt", "tracking.json"
+DRIFT_FILE, PATH_FILE = "drift.svg", "path.svg"
 MIN_POSES = 3  # frames that errors are measured on
 
 
@@ -33,6 +34,7 @@ class Tracked:
     images:  their numbers in the scene, in the order of exposure; lost: those of frames where tracking failed
     moments: seconds, or frame numbers for a source without times
     truth:   poses of the source; None if unknown
+    loops:   pairs of images between which a loop was closed
     """
 
     images: list[int]
@@ -40,6 +42,7 @@ class Tracked:
     moments: list[float]
     poses: Poses
     truth: Float[np.ndarray, "pose 3 4"] | None
+    loops: list[tuple[int, int]]
 
     @staticmethod
     def of(method: Any, scene: Scene) -> Tracked:
@@ -52,7 +55,8 @@ class Tracked:
         truth = scene.about.get(TRUE_POSE)
         known = None if truth is None else truth[chosen].double().numpy()
         poses = cameras.pose.double().cpu().numpy()
-        return Tracked(chosen.tolist(), order[state[order] == LOST].tolist(), moments, poses, known)
+        loops = [] if method.tracker.loops is None else method.tracker.loops.pairs.tolist()
+        return Tracked(chosen.tolist(), order[state[order] == LOST].tolist(), moments, poses, known, loops)
 
     @property
     def errors(self) -> TrajectoryErrors | None:
@@ -73,6 +77,28 @@ class Tracked:
             Series("frame to frame", path[1:], (100 * shift).tolist()),
         ]
         return line_chart(curves, "metres of the path", "error, cm", smoothed=False)
+
+    @property
+    def map(self) -> str:
+        """Chart of the path with its loops, on the plane in which it extends most; beside the true one, if known."""
+        if len(self.images) < MIN_POSES:
+            return ""
+        told = self.truth is not None
+        found = (aligned(self.poses, self.truth) if self.truth is not None else self.poses)[:, :, 3]
+        middle = found.mean(0)
+        plane = np.linalg.svd(found - middle, full_matrices=False)[2][:2].T
+        x, y = ((found - middle) @ plane).T
+        curves = [Series("found", x.tolist(), y.tolist(), 0)]
+        if self.truth is not None:
+            u, v = ((self.truth[:, :, 3] - middle) @ plane).T
+            curves.insert(0, Series("true", u.tolist(), v.tolist(), 1))
+        number = {image: i for i, image in enumerate(self.images)}
+        for first, second in self.loops:
+            ends = [number[first], number[second]]
+            (a, b), (c, d) = x[ends].tolist(), y[ends].tolist()
+            name = "loops" if len(curves) == 1 + told else ""
+            curves.append(Series(name, [a, 0.5 * (a + b), b], [c, 0.5 * (c + d), d], 2))
+        return line_chart(curves, "metres", "metres", smoothed=False, equal=True)
 
 
 def tracks(method: Method) -> bool:
@@ -116,6 +142,8 @@ def write_tracking(
     files.write_bytes(run.folder / TRAJECTORY_FILE, to_tum(found.moments, found.poses).encode(), ours=True)
     about: dict[str, Any] = {"frames": len(scene), "known": len(found.images)} | figures
     about["lost"] = [scene.names[i] for i in found.lost]
+    if found.map:
+        files.write_bytes(run.folder / PATH_FILE, standalone(found.map), ours=True)
     if (errors := found.errors) is not None:
         assert found.truth is not None
         files.write_bytes(run.folder / TRUTH_FILE, to_tum(found.moments, found.truth).encode(), ours=True)

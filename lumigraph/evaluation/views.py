@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from ..metrics.lpips import DEFINITION, Lpips
 from ..readers.views import with_fewer_views
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .baseline import Baselines
 from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
 from .held_out import held_out_kinds
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
@@ -74,6 +75,7 @@ class ViewScore:
     detail: FineDetail | None = None
     held_out: str | None = None
     depth_error: float | None = None  # mean over pixels with a measured depth, percent of the distance
+    baselines: dict[str, float] = field(default_factory=dict)  # PSNR of trivial stand-ins, see `baseline`
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,12 @@ class ViewsEvaluation:
     def depth_error(self) -> float | None:
         """Mean error of depth in percent of the distance; None without measurements."""
         return mean_known(each.depth_error for each in self._averaged)
+
+    @property
+    def baselines(self) -> dict[str, float]:
+        """Mean PSNR of each trivial stand-in, likewise; empty for training photographs."""
+        names = self._averaged[0].baselines
+        return {name: mean(each.baselines[name] for each in self._averaged) for name in names}
 
     @property
     def detail(self) -> FineDetail | None:
@@ -188,6 +196,7 @@ class ViewsEvaluation:
             **self.means(),
             **({"by_resolution": sizes} if len(sizes) > 1 else {}),
             **({"by_held_out": kinds} if kinds else {}),
+            **({"baselines": self.baselines} if self.baselines else {}),
             **({} if self.detail is None else {"detail": asdict(self.detail)}),
             "protocol": self.protocol,
             "seconds_per_view": self.seconds_per_view,
@@ -241,6 +250,7 @@ def evaluate(
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread = set(evenly(compared, SHEET_VIEWS))
     found, kinds = held_out_poses(method, scene), held_out_kinds(scene)
+    stand_ins = None if split == "train" else Baselines(scene, method.evidence_views)
     known = [name for name in (CLEAN_LAYER, LIGHT_LAYER, MOVING_LAYER, DEPTH_LAYER) if name in scene.layers]
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
@@ -263,7 +273,8 @@ def evaluate(
         score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
         if DEPTH_LAYER in shot.extra:
             score = replace(score, depth_error=depth_error(seen, shot.extra[DEPTH_LAYER]))
-        score = replace(score, held_out=kinds[index])
+        trivial = {} if stand_ins is None else stand_ins.of(index, (photograph.shape[0], photograph.shape[1]))
+        score = replace(score, held_out=kinds[index], baselines=trivial_scores(trivial, shot, photograph, columns))
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
@@ -325,6 +336,18 @@ def compare(
         closeness = psnr(rgb[mask], photograph[mask]), of_windows(likeness, mask) or 0.0
         perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
     return ViewScore(name, size, *closeness, seconds, perceived, clean, *about_moving, shown)
+
+
+def trivial_scores(
+    pictures: dict[str, Picture], shot: Photograph, photograph: Picture, columns: slice
+) -> dict[str, float]:
+    """PSNR of stand-ins for a photograph, of the pixels that `compare` compares."""
+    kept = torch.ones(photograph.shape[:2], dtype=torch.bool) if shot.mask is None else shot.mask
+    kept, truth = kept[:, columns], photograph[:, columns]
+    if LIGHT_LAYER in shot.extra:
+        light = shot.extra[LIGHT_LAYER].clamp(0, 1)
+        pictures = {name: encoded(aligned(decoded(rgb), light).clamp(0, 1)) for name, rgb in pictures.items()}
+    return {name: psnr(rgb[:, columns][kept], truth[kept]) for name, rgb in pictures.items()}
 
 
 def of_pixels(

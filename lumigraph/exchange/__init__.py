@@ -108,7 +108,7 @@ def write_gaussians(
     sound = checked(gaussians, f"what is to be written to {path}", "remove them first")
     offset = None
     if sound.means.dtype == torch.float64 and ending != ".ply":
-        offset = sound.means.median(0).values.round()
+        offset = sound.means.detach().median(0).values.round()
         sound = replace(sound, means=(sound.means - offset).float())
     with counting(f"Writing {path.name}"):
         if path.name == streamed_sog.META:

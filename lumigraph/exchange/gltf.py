@@ -254,8 +254,8 @@ def refuse_compressed(path: Path) -> None:
         text = head + file.read(min(length, MAX_JSON_BYTES))
     if found := [name for name in PACKINGS if f'"{name}"'.encode() in text]:
         raise LumigraphError(
-            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression, for instance "
-            "from Blender, which opens it"
+            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression, "
+            "for instance from Blender, which opens it"
         )
     if f'"{KTX2}"'.encode() in text:
         text = f"{path} has textures of KTX2, which are not read; colours are those of its materials"

@@ -5,7 +5,8 @@ the current one, is written; pages hold 3, which unpacks where there is no zstd 
 three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
 back turned by 13 degrees.
 
-Axes are x right, y up, z back: see `codes.TURN_MEAN`.
+Axes are x right, y up, z back: see `codes.TURN_MEAN`. Adobe's extension names others (`in_system`). Further extensions,
+and harmonics of degree 4, are passed over with a warning.
 
 What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
 clouds. Scales are within 1/32 (3%) of their logarithm from -10 to 5.9. Opacities are within 1/510, plain colours within
@@ -20,13 +21,16 @@ import gzip
 import io
 import math
 import struct
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import zstandard
 from jaxtyping import Float, UInt8
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import write_bytes
 from ..gaussians import Gaussians
 from .checks import check_room
@@ -50,19 +54,25 @@ HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behin
 MAGIC, GZIP_VERSION, NEWEST_VERSION = b"NGSP", 3, 4
 HEADER_V4 = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
 STREAM = struct.Struct("<QQ")  # packed and unpacked bytes
-ANTIALIASED, EXTENDED = 1, 2  # flags
+ANTIALIASED, EXTENDED, LEVELS = 1, 2, 128  # flags; the last is Spark's, for a tree of levels of detail
 MAX_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
 MAX_FIXED = 2**23 - 1
 COLOUR_SCALE = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
 HARMONICS_STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
 MAX_DEFLATE_RATIO = 1032  # times that deflate can shrink what it is given
 MAX_EXTENSION_BYTES = 1 << 20  # bytes
+MAX_DEGREE = 4  # of harmonics in a file
+RECORD = struct.Struct("<II")  # of an extension: kind, bytes that follow
+COORDINATE_SYSTEM = 0xADBE0003
+EXTENSIONS = {COORDINATE_SYSTEM: "SPZ_ADOBE_coordinate_system", 0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
+SYSTEMS = "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # by number; 0 names none
+DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 GZIP_LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
 ZSTD_LEVEL = 12
 
 
 def read(path: Path) -> Gaussians:
-    """Read versions 1 to 4. Extensions are skipped. Raises LumigraphError for others and for damaged files."""
+    """Read versions 1 to 4. Raises LumigraphError for others and for damaged files."""
     data = path.read_bytes()
     stream: io.BufferedIOBase
     if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
@@ -131,9 +141,11 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     check_room(path, count, (degree + 1) ** 2, limit // MAX_DEFLATE_RATIO, count * sum(widths))
     columns = [np.frombuffer(take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
     behind = stream.read(MAX_EXTENSION_BYTES + 1)  # to the end, where gzip's checksum is
+    if flags & LEVELS:
+        raise LumigraphError(f"{path} has levels of detail, which are not read; save it without them")
     if len(behind) > (MAX_EXTENSION_BYTES if flags & EXTENDED else 0):
         raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
-    return _cloud(columns, version, bits, flags)
+    return extended(path, _cloud(path, columns, version, bits, flags), behind)
 
 
 def _decode_tabled(path: Path, data: bytes) -> Gaussians:
@@ -158,17 +170,18 @@ def _decode_tabled(path: Path, data: bytes) -> Gaussians:
             found = take(reader, unpacked)
         columns.append(np.frombuffer(found, np.uint8).reshape(count, width))
         at += packed
-    return _cloud(columns, version, bits, flags)
+    block = data[HEADER_V4.size : table] if flags & EXTENDED else b""
+    return extended(path, _cloud(path, columns, version, bits, flags), block)
 
 
 def _widths(path: Path, version: int, degree: int) -> list[int]:
     """Bytes of one Gaussian in each stream: position, opacity, colour, scale, rotation, harmonics beyond degree 0."""
-    if degree > 3:
-        raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to 3")
+    if degree > MAX_DEGREE:
+        raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to {MAX_DEGREE}")
     return [6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
 
 
-def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
+def _cloud(path: Path, columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
     positions, alphas, colours, scales, rotations, rest = columns
     means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
     if version >= 3:
@@ -177,6 +190,9 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
         quaternions = with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
     plain = (colours / 255 - 0.5) / COLOUR_SCALE
     rest = (rest.reshape(len(rest), rest.shape[1] // 3, 3) - 128.0) / 128
+    if rest.shape[1] >= len(TURN_HARMONICS):
+        warnings.warn(f"{path}: harmonics of degree {MAX_DEGREE} are passed over", LumigraphWarning, stacklevel=3)
+        rest = rest[:, : len(TURN_HARMONICS) - 1]
     harmonics = np.concatenate([plain[:, None], rest], 1)
     return cloud(
         means * TURN_MEAN,
@@ -186,6 +202,38 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
         harmonics * TURN_HARMONICS[: harmonics.shape[1]],
         bool(flags & ANTIALIASED),
     )
+
+
+def extended(path: Path, gaussians: Gaussians, block: bytes) -> Gaussians:
+    """The cloud with what the records of extensions mean. Warns of those that are passed over."""
+    unused = []
+    while len(block) >= RECORD.size:
+        kind, size = RECORD.unpack_from(block)
+        content, block = block[RECORD.size : RECORD.size + size], block[RECORD.size + size :]
+        system = int.from_bytes(content, "little")
+        if kind == COORDINATE_SYSTEM and len(content) == size == 4 and system < len(SYSTEMS):
+            gaussians = in_system(gaussians, SYSTEMS[system])
+        else:
+            unused.append(EXTENSIONS.get(kind, f"{kind:#010x}"))
+    if unused:
+        warnings.warn(f"{path}: extensions passed over: {', '.join(unused)}", LumigraphWarning, stacklevel=3)
+    return gaussians
+
+
+def in_system(gaussians: Gaussians, axes: str) -> Gaussians:
+    """A cloud whose numbers were read as x right, y up, z back, and mean three other directions, such as "RUF".
+
+    Systems of the other hand mirror: M is -1 times a rotation, which turns the covariances, and harmonics of odd degree
+    change sign.
+    """
+    matrix = np.array([DIRECTIONS[axis] for axis in axes], float).T * TURN_MEAN
+    sign = round(np.linalg.det(matrix))
+    place = np.eye(4)
+    place[:3, :3] = sign * matrix
+    turned = gaussians.transformed(torch.from_numpy(place), far=True)
+    odd = torch.tensor([math.isqrt(i) % 2 for i in range(turned.harmonics.shape[1])], dtype=torch.bool)
+    harmonics = torch.where(odd[:, None], sign * turned.harmonics, turned.harmonics)
+    return replace(turned, means=sign * turned.means, harmonics=harmonics)
 
 
 def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Vectors:

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from ..camera import Camera
+from ..color.tags import save_srgb
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
 from ..depth_maps.multi_view import multi_view_depth, pair_depth
@@ -73,7 +74,7 @@ def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Ima
             name = f"{Path(scene.names[int(seen.camera.image_index)]).stem}.png"  # type: ignore[arg-type]
             levels = (seen.depth.nan_to_num(0, 0, 0) / unit).round().clamp(0, MAX_LEVEL).numpy()
             Image.fromarray(levels.astype(np.uint16)).save(partial / "depth" / name)
-            to_image(seen.rgb).save(partial / "images" / name)
+            save_srgb(to_image(seen.rgb), partial / "images" / name)
             frames.append(
                 {"file_path": f"images/{name}", "depth_file_path": f"depth/{name}", **about(seen.camera, to_source)}
             )

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
+from ..color.tags import save_srgb
 from ..components.training.development import decoded
 from ..errors import LumigraphError
 from ..figures import Range, colour_depth, depth_range, to_bytes
@@ -118,7 +119,7 @@ def film(
             for target, ending, frame in zip(targets, ("", "-depth"), frames, strict=False):
                 target.add(frame)
                 if pictures:
-                    Image.fromarray(frame.numpy()).save(folder / f"{i:04d}{ending}.png")
+                    save_srgb(Image.fromarray(frame.numpy()), folder / f"{i:04d}{ending}.png")
             if pictures == "exr":
                 (folder / f"{i:04d}.exr").write_bytes(exr(light_of(seen)))
         seconds = (time.perf_counter() - begin) / len(cameras)

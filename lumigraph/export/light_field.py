@@ -9,6 +9,7 @@ from PIL import Image
 
 from ..camera import Camera
 from ..camera.lens import OpenCV, Pinhole
+from ..color.tags import save_srgb
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..figures import save_picture, to_image
@@ -81,7 +82,7 @@ def write_light_field(
         for row, column in track(places, "Light field", len(places)):
             x, y = (scale * (k - (count - 1) / 2) for k in (column, row))
             name = f"out_{row:02}_{column:02}_{y:.6f}_{x:.6f}.png"
-            to_image(method.render(grid[row][column]).cpu().rgb).save(partial / name)
+            save_srgb(to_image(method.render(grid[row][column]).cpu().rgb), partial / name)
             frames.append({"file_path": name, **about(grid[row][column], to_export)})
         write_json(partial / "transforms.json", {"camera_model": "PINHOLE", "frames": frames}, ours=True)
 

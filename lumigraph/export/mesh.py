@@ -32,9 +32,11 @@ from .surface import (
     Faces,
     Grid,
     Vertices,
+    face_normals,
     larger_pieces,
     majority,
     manifold,
+    name_cut,
     simplified,
     smoothed,
     vertex_normals,
@@ -55,6 +57,8 @@ CUT_ROUNDS = 30  # rounds of diffusion in which the line where an open surface i
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
+CUT_STRIDE = 16  # pixels that show a surface, of which one is asked for the share outside
+OUTSIDE, WAY_OUT = "lies outside the meshed region", "a larger --extent, --box or --sphere holds more"
 
 Way = Literal["distance", "density", "own", "depth"]
 
@@ -79,7 +83,8 @@ def extract_mesh(
     crop: Crop | None = None,
     photographs: Scene | None = None,
 ) -> Mesh:
-    """Extract the surface in the box of interest or a crop, in the scene's frame.
+    """Extract the surface in the box of interest or a crop, in the scene's frame; a method's own mesh is whole, unless
+    an extent or a crop is given. A warning has the share of the surface outside.
 
     cameras: the scene's own; what none of them sees is left out, or filled in
     crop:    replaces the box of interest, within the scene's reach
@@ -97,7 +102,8 @@ def extract_mesh(
     cell = None if options.cell_size is None else options.cell_size / method.frame.to_export.scale
     grid, way = make_grid(limits, cell), best_way(method)[0] if options.way == "auto" else options.way
     faces = TEXTURED_FACES if options.faces is None and texture is not None else options.faces
-    made = own_mesh(method, holds, options.keep, options.smooth, faces) if way == "own" else None
+    whole = crop is None and options.extent is None  # of an own mesh: its size is that of what was measured
+    made = own_mesh(method, None if whole else holds, options.keep, options.smooth, faces) if way == "own" else None
     if made is not None and texture is None:
         return made
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
@@ -107,7 +113,10 @@ def extract_mesh(
         chosen = evenly(range(len(cameras)), options.views)
         learnt = without_masked(depth_maps, photographs, chosen)
         sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
-    if made is not None and texture is not None:
+    if made is None:
+        shown = torch.cat([x.positions(x.solid)[::CUT_STRIDE] for x in learnt])
+        name_cut(float((~holds(shown)).float().sum()) / max(len(shown), 1), OUTSIDE, WAY_OUT)
+    elif texture is not None:
         surface = made.vertices, made.faces
         return textured(surface, sources, HIDDEN_CELLS * grid.cell, texture, surface)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
@@ -165,11 +174,15 @@ def masked(depth_maps: Sequence[DepthMap]) -> bool:
     return any(bool(seen.depth.isnan().any()) for seen in depth_maps)
 
 
-def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int | None) -> Mesh:
-    """The method's own mesh within a region, with its own colours; see `extract_mesh`."""
+def own_mesh(method: Method, holds: Holds | None, keep: float, smooth: int, faces: int | None) -> Mesh:
+    """The method's own mesh, whole or within a region, with its own colours; see `extract_mesh`."""
     made = needs(method, HasMesh).mesh()
-    inside = holds(torch.from_numpy(made.vertices).float()).numpy()
-    corners, triangles = manifold(made.faces[inside[made.faces].all(-1)])
+    kept = np.ones(len(made.faces), bool)
+    if holds is not None:
+        kept = holds(torch.from_numpy(made.vertices).float()).numpy()[made.faces].all(-1)
+        areas = np.linalg.norm(face_normals(made.vertices, made.faces), axis=-1)
+        name_cut(areas[~kept].sum() / max(areas.sum(), 1e-30), OUTSIDE, WAY_OUT)
+    corners, triangles = manifold(made.faces[kept])
     if not len(triangles):
         raise LumigraphError("No part of the mesh lies inside the box; give a larger --extent, or another box")
     vertices = made.vertices[corners]

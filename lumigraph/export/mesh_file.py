@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from ..color.srgb import linear_from_srgb
+from ..color.tags import srgb_bytes
 from ..datasets.mesh import Mesh, MeshTexture
 from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
@@ -168,7 +169,7 @@ def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
     lines = ["# written by Lumigraph", "newmtl surface", colour, f"map_Kd {file.name}{PICTURE}"]
     parts = {"": held.getvalue().encode(), MATERIAL: b"", PICTURE: png(texture.colours)}
     if texture.normals is not None:
-        parts[NORMALS] = png(texture.normals)
+        parts[NORMALS] = png(texture.normals, colours=False)
         lines.append(f"norm {file.name}{NORMALS}")
     return parts | {MATERIAL: "".join(line + "\n" for line in lines).encode()}
 
@@ -193,7 +194,7 @@ def glb(file: MeshFile) -> Parts:
         if texture.normals is not None:
             frame = tangents(mesh.vertices, mesh.faces, texture.uv, file.normals)
             columns["TANGENT"] = gltf.Column(frame.astype("<f4"))
-            pictures.append(("image/png", png(texture.normals)))
+            pictures.append(("image/png", png(texture.normals, colours=False)))
             material["normalTexture"] = {"index": 1}
     about: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
@@ -241,9 +242,7 @@ def glb(file: MeshFile) -> Parts:
 
 
 def jpeg(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    held = io.BytesIO()
-    Image.fromarray(picture).save(held, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return held.getvalue()
+    return srgb_bytes(Image.fromarray(picture), "JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 
 def as_trimesh(file: MeshFile) -> trimesh.Trimesh:

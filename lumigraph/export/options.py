@@ -135,7 +135,8 @@ class MeshOptions:
     """Options of a mesh, lengths in the unit of exports."""
 
     extent: Annotated[
-        Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
+        Annotated[float, between(0.001, 1000)] | None,
+        option("TIMES", "1 for objects, 1.5 for the rest, own meshes whole"),
     ] = None
     """Size of the meshed region, times the box of interest in `lumigraph info`; or give --box or --sphere."""
     cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None

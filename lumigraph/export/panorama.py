@@ -25,6 +25,7 @@ from torch.nn.functional import grid_sample
 from ..camera import Camera
 from ..camera.lens import Equirectangular, OmnidirectionalStereo, Pinhole
 from ..camera.rays import Rendering
+from ..color.tags import save_srgb
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..figures import to_image
@@ -231,7 +232,7 @@ def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -
     if path.suffix.lower() != ".png":
         about |= {"quality": JPEG_QUALITY, "subsampling": 0}
     with replacing(path, "panorama") as partial:
-        image.save(partial, picture_format(path), **about)
+        save_srgb(image, partial, picture_format(path), **about)
 
 
 def picture_format(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ..camera.crop import Crop
 from ..datasets.scene import Frame, GeographicOrigin
 from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
+from ..files import write_bytes
 from ..files.ply import write_rows
 from ..geometry import is_far
 from ..method import Method
@@ -22,10 +24,12 @@ from ..system.progress import counting, track
 from ..system.work import at_work
 from .loaded import Loaded
 from .options import PointsOptions
+from .surface import name_cut
 
 CANDIDATES_PER_POINT = 4  # pixels that are considered for each point
 MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
 DEPTH_TOLERANCE = 0.01  # of the distance from the camera: depths that agree
+LAS_STEP = 1e-4  # of the distance between neighbours, to which coordinates are rounded
 MIN_VIEWS = 2  # further cameras that must see a surface at the same place, where there are so many
 
 
@@ -40,6 +44,11 @@ class PointCloud:
     positions: Float[np.ndarray, "point 3"]
     normals: Float[np.ndarray, "point 3"]
     colours: UInt8[np.ndarray, "point 3"]
+
+    @property
+    def spacing(self) -> float:
+        """About the distance between neighbours."""
+        return float(np.ptp(self.positions, axis=0).max()) / max(len(self.positions), 1) ** 0.5
 
     def in_source(self, frame: Frame) -> PointCloud:
         """From the scene's frame to that of the capture, in the unit of exports."""
@@ -69,6 +78,9 @@ def extract_points(
     method.eval()
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
     good = [wanted(seen, crop) for seen in depth_maps]
+    if crop is not None:
+        inside, every = (sum(int(x.sum()) for x in masks) for masks in (good, [wanted(x, None) for x in depth_maps]))
+        name_cut(1 - inside / max(every, 1), "lies outside the crop", "a larger one holds more")
     share = min(1.0, CANDIDATES_PER_POINT * options.count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []
@@ -132,13 +144,16 @@ def cells(
 
 
 def write_points(path: Path, points: PointCloud, origin: GeographicOrigin | None = None) -> None:
-    """A binary PLY file: x y z (float32, or float64 far from the origin), nx ny nz (float32), red green blue (bytes).
+    """A binary PLY file: x y z (float32, or float64 far from the origin), nx ny nz (float32), red green blue (bytes);
+    or `las` by the ending.
 
-    origin: of the points' frame on Earth, for a comment
+    origin: of the points' frame on Earth, for a comment of a PLY file
     """
+    if path.suffix.lower() != ".ply":
+        write_bytes(path, las(path, points), "points")
+        return
     floats, bytes_ = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
-    spacing = float(np.ptp(points.positions, axis=0).max()) / max(len(points.positions), 1) ** 0.5
-    exact = "<f8" if is_far(points.positions, spacing) else "<f4"
+    exact = "<f8" if is_far(points.positions, points.spacing) else "<f4"
     kinds = [*((name, exact) for name in floats[:3]), *((name, "<f4") for name in floats[3:])]
     rows = np.empty(len(points.positions), [*kinds, *((name, "u1") for name in bytes_)])
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
@@ -147,3 +162,24 @@ def write_points(path: Path, points: PointCloud, origin: GeographicOrigin | None
     write_rows(
         path, "points", {"vertex": rows}, ["written by Lumigraph", *([] if origin is None else [origin.sentence])]
     )
+
+
+def las(path: Path, points: PointCloud) -> bytes:
+    """A LAS file, packed if the name ends in .laz: integers of 32 bits with a scale of a power of ten and an offset in
+    doubles, colours of 16 bits, normals in extra dimensions. Raises LumigraphError without laspy."""
+    try:
+        import laspy
+    except ImportError as fault:
+        raise LumigraphError(f"{path} needs laspy; install it: pip install 'lumigraph[lidar]', or name .ply") from fault
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    header.generating_software, header.offsets = "Lumigraph", np.median(points.positions, 0).round()
+    largest = np.abs(points.positions - header.offsets).max()
+    step = max(LAS_STEP * points.spacing, largest / np.iinfo(np.int32).max, np.finfo(np.float32).tiny)
+    header.scales = np.full(3, 10.0 ** np.ceil(np.log10(step)))
+    header.add_extra_dims([laspy.ExtraBytesParams(f"Normal{axis}", "f4") for axis in "XYZ"])
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = points.positions.T
+    made.red, made.green, made.blue = 257 * points.colours.T.astype(np.uint16)
+    made.NormalX, made.NormalY, made.NormalZ = points.normals.T.astype(np.float32)
+    made.write(held := io.BytesIO(), do_compress=path.suffix.lower() == ".laz")
+    return held.getvalue()

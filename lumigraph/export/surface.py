@@ -3,6 +3,7 @@ meshes: removal of small pieces, smoothing, simplification."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,10 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from ..depth_maps.level_set import zero_level_of_blocks
+from ..errors import LumigraphWarning
 from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
 BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
+SHORTEST = 1e-30  # vector that has a direction
+MIN_CUT = 0.005  # share of a surface, from which on it is said to be left out
 MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
 Vertices = Float[np.ndarray, "vertex 3"]
@@ -106,7 +110,15 @@ def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.
     visible = np.bincount(piece[seen], minlength=len(areas)) > 0
     areas = np.where(visible, areas, 0)
     keep = visible & (areas >= share * areas.max())
+    name_cut(areas[~keep].sum() / max(areas.sum(), 1e-30), "is in small pieces", "a smaller --keep keeps more of them")
     return compact(vertices, faces[keep[piece[faces[:, 0]]]])
+
+
+def name_cut(share: float, where: str, way_out: str) -> None:
+    """Warn of a share of the surface that an export leaves out."""
+    if share >= MIN_CUT:
+        sentence = f"{100 * share:.2g} % of the surface {where} and is left out; {way_out}"
+        warnings.warn(sentence, LumigraphWarning, stacklevel=3)
 
 
 def majority(chosen: Bool[np.ndarray, " vertex"], faces: Faces, times: int) -> Bool[np.ndarray, " vertex"]:
@@ -168,10 +180,12 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> Triangles:
 
 
 def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
-    """Unit normals: the sum of those of the faces around, by area; zero where they cancel."""
+    """Unit normals: the sum of those of the faces around, by area; that of the largest one where they cancel."""
     across = face_normals(vertices, faces)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(across[:, k], 3), len(vertices)) for k in range(3)], -1)
-    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
+    rising = np.argsort(np.linalg.norm(across, axis=-1), kind="stable")
+    largest = np.zeros((len(vertices), 3))
+    largest[faces[rising]] = across[rising][:, None]
+    return unit(vertex_sums(across, faces, len(vertices)), unit(largest, np.array([0.0, 0.0, 1.0])))
 
 
 def tangents(
@@ -182,13 +196,25 @@ def tangents(
     (a, b, c), (u, v, w) = vertices[faces].swapaxes(0, 1), (uv * [1, -1])[faces].swapaxes(0, 1)
     (du, dv), (eu, ev) = (v - u).T[:, :, None], (w - u).T[:, :, None]
     turned = np.sign(du * ev - eu * dv)
-    along = turned * (ev * (b - a) - dv * (c - a))
-    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
-    weighted = np.hstack([along, turned]) * np.linalg.norm(face_normals(vertices, faces), axis=-1, keepdims=True)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3), len(vertices)) for x in weighted.T], -1)
-    along = total[:, :3] - (total[:, :3] * normals).sum(-1, keepdims=True) * normals
-    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
+    along = unit(turned * (ev * (b - a) - dv * (c - a)))
+    area = np.linalg.norm(face_normals(vertices, faces), axis=-1, keepdims=True)
+    total = vertex_sums(np.hstack([along, turned]) * area, faces, len(vertices))
+    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(-1)])
+    along = unit(total[:, :3] - (total[:, :3] * normals).sum(-1, keepdims=True) * normals, unit(across))
     return np.hstack([along, np.where(total[:, 3:] < 0, -1.0, 1.0)])
+
+
+def vertex_sums(
+    values: Float[np.ndarray, "face column"], faces: Faces, count: int
+) -> Float[np.ndarray, "vertex column"]:
+    """Sums of the values of the faces around each of `count` vertices."""
+    return np.stack([np.bincount(faces.ravel(), np.repeat(x, 3), count) for x in values.T], -1)
+
+
+def unit(rows: Float[np.ndarray, "row 3"], otherwise: Float[np.ndarray, "*row 3"] | float = 0.0) -> Vertices:
+    """Rows of length 1; other ones, zeros by default, where they have no direction."""
+    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.where(lengths > SHORTEST, rows / np.maximum(lengths, SHORTEST), otherwise)
 
 
 def face_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "face 3"]:

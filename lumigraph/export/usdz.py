@@ -1,21 +1,24 @@
 """USDZ: an archive of one mesh and its pictures, for augmented reality on phones and tablets.
 
 Viewers draw no vertex colours, so a mesh without a texture has its colours in a picture: two by two texels for each
-triangle, between whose centres a GPU interpolates as between vertices. The layer in the archive is text, so no library
-of USD is needed.
+triangle, between whose centres a GPU interpolates as between vertices. No library of USD is needed: without usd-core
+the layer in the archive is text.
 """
 
 from __future__ import annotations
 
 import io
+import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from string import Template
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
+from ..color.tags import srgb_bytes
 from ..datasets.mesh import Mesh
 from ..exchange.codes import morton_order
 
@@ -132,7 +135,21 @@ def usdz(mesh: Mesh, normals: Float[np.ndarray, "vertex 3"], upright: Float[np.n
         surface=(LIT + ("" if detail is None else BUMPY)) if lit else UNLIT,
         pictures=shaders.strip("\n"),
     )
-    return archive({"scene.usda": layer.encode()} | {f"{name}.png": png(x) for name, x in pictures.items()})
+    parts = {f"{name}.png": png(x, name == COLOURS) for name, x in pictures.items()}
+    return archive(binary(layer) | parts)
+
+
+def binary(layer: str) -> dict[str, bytes]:
+    """The root of an archive by its name: a layer in binary, a third of the bytes; its text without usd-core."""
+    try:
+        from pxr import Sdf
+    except ImportError:
+        return {"scene.usda": layer.encode()}
+    made = Sdf.Layer.CreateAnonymous(".usda")
+    made.ImportFromString(layer)
+    with tempfile.TemporaryDirectory() as folder:
+        made.Export(str(file := Path(folder) / "scene.usdc"))
+        return {file.name: file.read_bytes()}
 
 
 def baked(mesh: Mesh) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "face 3 2"]]:
@@ -180,7 +197,10 @@ def archive(parts: Mapping[str, bytes]) -> bytes:
     return held.getvalue()
 
 
-def png(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    held = io.BytesIO()
-    Image.fromarray(picture).save(held, "PNG")
+def png(picture: UInt8[np.ndarray, "height width 3"], colours: bool = True) -> bytes:
+    """A PNG, with the tag of sRGB for colours."""
+    image = Image.fromarray(picture)
+    if colours:
+        return srgb_bytes(image)
+    image.save(held := io.BytesIO(), "PNG")
     return held.getvalue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ..color.blending import before
+from ..color.tags import save_srgb, srgb_bytes
 from ..files import Kind, replacing
 
 # Bright and warm to dark and cool, evenly falling in lightness.
@@ -35,8 +35,7 @@ def to_image(rgb: Float[Tensor, "height width 3"]) -> Image.Image:
 
 
 def png(rgb: Float[Tensor, "height width 3"]) -> bytes:
-    to_image(rgb).save(held := io.BytesIO(), "PNG")
-    return held.getvalue()
+    return srgb_bytes(to_image(rgb))
 
 
 def save_picture(
@@ -45,7 +44,7 @@ def save_picture(
     """Write a PNG, whole or not at all. kind, ours: as for `files.replacing`."""
     image = rgb if isinstance(rgb, Image.Image) else to_image(rgb)
     with replacing(path, kind, ours) as partial:
-        image.save(partial, "PNG")
+        save_srgb(image, partial)
 
 
 def depth_range(depth: Float[Tensor, "*pixels"], opacity: Float[Tensor, "*pixels"]) -> Range:

@@ -42,6 +42,7 @@ def line_chart(
     smoothed: bool = True,
     note: str = "",
     x_ticks: Sequence[float] = (),
+    equal: bool = False,
 ) -> str:
     """Each series twice: faint as measured, bold as averaged. Empty if no series has two points.
 
@@ -52,17 +53,20 @@ def line_chart(
     smoothed:   if not, the measured curve alone, bold
     note:       a few words below the plot
     x_ticks:    ticks of the x axis in rising order, instead of round numbers
+    equal:      both axes have one scale, as on a map
     """
     kept = [thinned(drawable(coloured(s, i), log_x, log)) for i, s in enumerate(series)]
     kept = [s for s in kept if len(s.x) > (0 if marks else 1)]
     if not kept:
         return ""
-    x_axis = spanning(
-        [x for s in kept for x in s.x], LEFT, WIDTH - RIGHT, log_x, pad=0.04 if marks else 0.0, from_zero=not log_x
-    )
+    pad, from_zero = 0.04 if marks or equal else 0.0, not (log_x or equal)
+    x_axis = spanning([x for s in kept for x in s.x], LEFT, WIDTH - RIGHT, log_x, pad=pad, from_zero=from_zero)
     y_axis = spanning(
         [y for s in kept for y in s.y], HEIGHT - BOTTOM, TOP, log, pad=0.06, outliers=0.02 if smoothed else 0.0
     )
+    if equal:
+        unit = max(abs((a.high - a.low) / (a.end - a.start)) for a in (x_axis, y_axis))
+        x_axis, y_axis = (a.widened(unit * abs(a.end - a.start)) for a in (x_axis, y_axis))
     lines = []
     for measured in kept:
         if lined := len(measured.x) > 2:
@@ -72,7 +76,7 @@ def line_chart(
             lines.append(f"<path class='bold {look(measured)}' d='{path(bold, x_axis, y_axis)}'/>")
         if marks or not lined:
             lines.append(dots(measured, x_axis, y_axis))
-    rows = legend_rows(kept if len(kept) > 1 else [], y_label)
+    rows = legend_rows([s for s in kept if s.name] if len(kept) > 1 else [], y_label)
     above = LINE_HEIGHT * (len(rows) - 1)
     names = (legend_row(row, 16 - above + LINE_HEIGHT * i) for i, row in enumerate(rows))
     parts = [axes(x_axis, y_axis, x_ticks or x_axis.ticks()), *lines, *names]
@@ -128,6 +132,11 @@ class Axis:
     def __call__(self, value: float) -> float:
         share = ((math.log10(value) if self.log else value) - self.low) / ((self.high - self.low) or 1)
         return self.start + min(max(share, 0), 1) * (self.end - self.start)
+
+    def widened(self, span: float) -> Axis:
+        """The axis with another span about the same middle."""
+        middle = 0.5 * (self.low + self.high)
+        return replace(self, low=middle - 0.5 * span, high=middle + 0.5 * span)
 
     def ticks(self) -> list[float]:
         """Round values along it."""

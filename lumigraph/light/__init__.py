@@ -23,7 +23,7 @@ from .. import files
 from ..color.srgb import linear_from_srgb
 from ..errors import LumigraphError
 from ..files.exr import read_exr
-from ..files.ffmpeg import decode
+from ..files.radiance import read_radiance
 from ..files.reading import reading
 from ..kernels import spherical_harmonics
 
@@ -240,5 +240,5 @@ def _values(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             values = linear_from_srgb(np.asarray(image.convert("RGB")) / 255)
     else:
-        values = read_exr(path).astype(np.float32) if suffix == ".exr" else decode(path)
+        values = read_exr(path).astype(np.float32) if suffix == ".exr" else read_radiance(path)
     return values if values.ndim == 3 else values[..., None]

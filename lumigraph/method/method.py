@@ -22,6 +22,8 @@ from ..exchange.packing import Stored
 from .controls import Control, Value
 from .part import Part
 
+SEED_STRIDE = 0x9E3779B1  # between the generators of two seeds, odd (Knuth 1998, section 6.4)
+
 
 @runtime_checkable
 class Lesson(Protocol):
@@ -148,6 +150,10 @@ class Method(nn.Module, ABC):
         """True if training is complete at any budget, such as after the last photograph of a fusion."""
         return False
 
+    def check_data(self, data: Any) -> None:
+        """Raise LumigraphError for data that this method cannot learn from; called before a new run compiles or learns
+        anything. Nothing is refused by default."""
+
     def begin(self, data: Any, seconds: float = math.inf) -> None:
         """Initialise from the data; called once, before the first step of a new run.
 
@@ -229,13 +235,10 @@ class Method(nn.Module, ABC):
         """The method with evidence (photographs, points, a light ...) or values of `controls`.
 
         The result shares all parameters and is an ordinary method for films, viewer and exports.
-        A method that takes evidence overrides this, and calls it for its controls.
         Raises LumigraphError for anything that the method does not accept.
         """
-        parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
-        chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
-        for piece, names in zip(evidence, chosen, strict=True):
-            if not names:
+        for piece in evidence:
+            if not isinstance(piece, self.takes):
                 kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
                 kind = type(piece).__name__
                 raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
@@ -249,10 +252,15 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.settings = self.settings | {name: known[name].checked(value) for name, value in controls.items()}
-        for piece, names in zip(evidence, chosen, strict=True):
-            for name in names:
-                told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
+        for piece in evidence:
+            for name, part in told.named_children():
+                if isinstance(part, Part) and isinstance(piece, part.accepts):
+                    told._modules[name] = part.adapted(told, piece)
+        told.take_evidence([piece for piece in evidence if isinstance(piece, self.accepts)], controls)
         return told
+
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Change the copy that `given` returns, by evidence of the class's own kinds and values of controls."""
 
     def control(self, name: str) -> Value:
         """Value of a control: as set, or its default."""
@@ -283,8 +291,9 @@ class Method(nn.Module, ABC):
         raise LumigraphError(f"{cls.__name__} cannot be made of {type(other).__name__}; it learns from data alone")
 
     def random(self, number: int) -> torch.Generator:
-        """Random generator seeded by the config's seed and a number, such as the step, for exact resuming."""
-        return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
+        """Random generator seeded by the config's seed and a number, such as the step, for exact resuming. Of its own
+        seed PyTorch's CPU generator reads the low 32 bits alone."""
+        return torch.Generator().manual_seed((SEED_STRIDE * self.config.seed + number) % (1 << 32))
 
     @property
     def device(self) -> torch.device:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
+import fast_simplification
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, interpolate, leaky_relu, normalize
 
@@ -15,10 +19,10 @@ from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..color.blending import over
+from ..components.fields.charts import unwrap
 from ..components.fields.kept_photographs import Kept
 from ..components.fields.mesh_picture import projected
-from ..components.image_based.depth import mesh_distance, shape
-from ..components.sampling.occupancy import visual_hull
+from ..components.image_based.depth import hull_surface, mesh_distance, shape
 from ..datasets.mesh import Mesh, MeshTexture
 from ..datasets.scene import Frame, Photograph, Scene
 from ..errors import LumigraphError
@@ -29,7 +33,7 @@ from ..system.progress import track
 from ..system.work import at_work
 
 TRACKED = "vertices"  # of `Scene.about`: a grid (row, column, 3) for each photograph, in the source's frame
-HULL_RESOLUTION, HULL_STEPS = 64, 256  # cells of a visual hull; places along each direction from its middle
+HULL_CELLS, HULL_PADDING = 128, 2  # cells of a visual hull along each axis; texels between its charts
 MIN_COSINE = 0.15  # between normal and view, up to which a texel is not taken from a photograph
 DEPTH_TOLERANCE = 0.02  # of distance, within which a texel is visible
 OPAQUE = 0.99  # alpha from which on a pixel's colour is the surface's
@@ -165,10 +169,10 @@ class DeepAppearance(Method):
         self.times, self.meshes = Kept(torch.empty(0)), Kept(torch.empty(0, vertices, 3))
         self.textures = Kept(torch.empty(0, 3, side, side, dtype=torch.uint8))
         self.networks = Networks(c, 3 * vertices, frame.times is not None)
-        faces, uv = grid_faces(c.mesh_rows, c.mesh_columns)
-        self.uv = uv
+        faces, self.uv = grid_faces(c.mesh_rows, c.mesh_columns)
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("beside", kernels.neighbours(faces), persistent=False)
+        self.hull = Kept(torch.empty(0, 15))
         self._unwrapped: Unwrapped | None = None
         self._codes: Tensor | None = None
 
@@ -197,9 +201,16 @@ class DeepAppearance(Method):
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         times, number = moments_of(data)
-        grids = tracked_meshes(data, self.config.mesh_rows, self.config.mesh_columns)
         first = [int((number == k).nonzero()[0, 0]) for k in range(len(times))]
-        self.times.rows, self.meshes.rows = times.to(self.device), grids[first].flatten(1, 2).to(self.device)
+        if TRACKED in data.about:
+            grids = tracked_meshes(data, self.config.mesh_rows, self.config.mesh_columns)
+            self.meshes.rows = grids[first].flatten(1, 2).to(self.device)
+        else:
+            self.hull.rows = charted_hull(data, len(self.faces), 1 << self.config.texture_log2).to(self.device)
+            self._lay_hull()
+            middle = self.hull.rows[:, :9].reshape(-1, 3).mean(0)
+            self.meshes.rows = middle.expand(1, len(self.mean_mesh), 3).contiguous()  # the networks learn no mesh
+        self.times.rows = times.to(self.device)
         seen = self._unwrap(data)
         rgb, shown = seen.rgb.float() / 255, seen.shown.float()
         mean = (rgb * shown).sum(0) / shown.sum(0).clamp_min(1)
@@ -217,17 +228,37 @@ class DeepAppearance(Method):
         spread = (self.meshes.rows - self.mean_mesh).square().mean()
         self.deviations.copy_(torch.stack([deviation.cpu(), spread.cpu()]).sqrt().clamp_min(MIN_DEVIATION))
 
+    def _lay_hull(self) -> None:
+        """Take faces, texture coordinates and neighbours from the kept hull, whose faces share no vertex."""
+        if rows := len(self.hull.rows):
+            corners = self.hull.rows[:, :9].reshape(-1, 3)
+            merged = corners.unique(dim=0, return_inverse=True)[1].view(-1, 3)
+            self.faces = torch.arange(3 * rows, device=self.device).view(-1, 3)
+            self.uv, self.beside = self.hull.rows[:, 9:].reshape(-1, 2).cpu(), kernels.neighbours(merged)
+
+    def placed(self, mesh: Float[Tensor, "vertex 3"]) -> Float[Tensor, "corner 3"]:
+        """Vertices of `faces`: of a moment's mesh, or of the hull of what stays still."""
+        return self.hull.rows[:, :9].reshape(-1, 3) if len(self.hull.rows) else mesh
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Load tensors. Older runs of still objects have a grid about the middle of the hull instead."""
+        found = super().load_state_dict({"hull.rows": self.hull.rows[:0], **state_dict}, strict, assign)
+        self._lay_hull()
+        return found
+
     def _unwrap(self, data: Scene) -> Unwrapped:
         """The training photographs as textures, kept; made again where a run is resumed."""
         if self._unwrapped is None:
             _, number = moments_of(data)
-            grids = self.meshes.rows.cpu().view(-1, self.config.mesh_rows, self.config.mesh_columns, 3)
-            parts = []
+            faces, parts = self.faces.cpu(), []
+            meshes = [self.placed(mesh).cpu() for mesh in self.meshes.rows]
+            texels = [texel_places(mesh, faces, self.uv, 1 << self.config.texture_log2) for mesh in meshes]
             train = data.splits["train"].tolist()
             for k, i in track(enumerate(train), "Unwrapping photographs", len(train)):
-                photograph, grid = data.photograph(i), grids[int(number[k])]
-                rgb, shown = unwrapped(photograph, grid, self.faces.cpu(), 1 << self.config.texture_log2)
-                parts.append((rgb, shown, view_of(photograph.camera, grid.view(-1, 3))))
+                photograph, moment = data.photograph(i), int(number[k])
+                rgb, shown = unwrapped(photograph, meshes[moment], faces, *texels[moment])
+                view = normalize(photograph.camera.position[0] - self.meshes.rows[moment].mean(0).cpu(), dim=-1)
+                parts.append((rgb, shown, view))
             rgb, shown, view = (torch.stack(x) for x in zip(*parts, strict=True))
             self._unwrapped = Unwrapped(rgb, shown, view, number)
         return self._unwrapped
@@ -296,7 +327,7 @@ class DeepAppearance(Method):
         middle = self.mean_mesh.mean(0)
         view = normalize(camera.position - middle, dim=-1)
         mesh, texture = self.networks.decode(code, view)
-        vertices = mesh.view(-1, 3) * self.deviations[1] + self.mean_mesh
+        vertices = self.placed(mesh.view(-1, 3) * self.deviations[1] + self.mean_mesh)
         return vertices, texture[0] * self.deviations[0] + self.mean_texture
 
     @at_work()
@@ -312,7 +343,7 @@ class DeepAppearance(Method):
     @torch.no_grad()
     def mesh(self) -> Mesh:
         """The mesh of the first moment, with its mean texture."""
-        first = self.meshes.rows[0].cpu()
+        first = self.placed(self.meshes.rows[0]).cpu()
         texture = self.mean_texture.cpu().movedim(0, -1)
         colours = sampled(self.mean_texture.cpu(), self.uv).clamp(0, 1).mul(255).round().byte()
         picture = MeshTexture(self.uv.numpy(), (texture.clamp(0, 1) * 255).round().byte().numpy())
@@ -368,61 +399,65 @@ def moments_of(data: Scene) -> tuple[Float[Tensor, " moment"], Int[Tensor, " pho
 
 
 def tracked_meshes(data: Scene, rows: int, columns: int) -> Float[Tensor, "photograph rows columns 3"]:
-    """The mesh of each training photograph, in the scene's frame: the tracked one, else a visual hull for all."""
-    train = data.splits["train"]
-    if TRACKED in data.about:
-        given = data.about[TRACKED][train].float()
-        moved = data.frame.to_source.inverse.points(given.reshape(-1, 3).double()).view(given.shape).float()
-    else:
-        moved = hull_mesh(data, rows, columns)[None].expand(len(train), -1, -1, -1)
+    """The tracked mesh of each training photograph, in the scene's frame."""
+    given = data.about[TRACKED][data.splits["train"]].float()
+    moved = data.frame.to_source.inverse.points(given.reshape(-1, 3).double()).view(given.shape).float()
     grid = interpolate(moved.movedim(-1, 1), (rows, columns), mode="bilinear", align_corners=True)
     return grid.movedim(1, -1).contiguous()
 
 
-def hull_mesh(data: Scene, rows: int, columns: int) -> Float[Tensor, "rows columns 3"]:
-    """Place at which the visual hull ends in each direction from its middle. LumigraphError where there is none."""
-    solid = visual_hull(data, HULL_RESOLUTION)
-    if not data.frame.has_alpha or solid.all() or not solid.any():
+def charted_hull(data: Scene, count: int, side: int) -> Float[Tensor, "face 15"]:
+    """Triangles of the visual hull, about `count`: places of three corners, then these in a texture of `side` texels a
+    side. Raises LumigraphError without a hull."""
+    if (hull := hull_surface(data, HULL_CELLS)) is None:
         raise LumigraphError(
             f"{data.source} has neither tracked meshes (`vertices` of each photograph, as procedural:head) nor one "
             "object with alpha that stays still, so there is no surface to put a texture on; give --masks, or train "
             "another method"
         )
-    cells = (solid.nonzero() + 0.5) * (2 / HULL_RESOLUTION) - 1
-    polar, around = torch.linspace(0, math.pi, rows)[:, None], torch.linspace(0, 2 * math.pi, columns)[None]
-    out = torch.stack([polar.sin() * around.cos(), polar.sin() * around.sin(), polar.cos() + 0 * around], -1)
-    along = torch.linspace(0, 2 * math.sqrt(3), HULL_STEPS)
-    places = cells.mean(0) + along[:, None, None, None] * out
-    index = ((places + 1) * (HULL_RESOLUTION / 2)).long()
-    inside = ((index >= 0) & (index < HULL_RESOLUTION)).all(-1)
-    i, j, k = index.clamp(0, HULL_RESOLUTION - 1).unbind(-1)
-    last = along[1] * (inside & solid[i, j, k]).long().cumprod(0).sum(0)
-    last = last - math.sqrt(3) / HULL_RESOLUTION  # a cell stays if the ball around it touches the silhouettes
-    return cells.mean(0) + last[..., None].clamp_min(1 / HULL_RESOLUTION) * out
+    vertices, faces = hull.vertices, hull.faces.astype(np.int32)
+    if len(faces) > count:
+        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=count)[:2]
+    original, charts, uv = unwrap(vertices, faces, side, HULL_PADDING)
+    rows = [vertices[original][charts].reshape(-1, 9), uv[charts].reshape(-1, 6)]
+    return torch.from_numpy(np.concatenate(rows, 1)).float()
 
 
-def view_of(camera: Camera, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, " 3"]:
-    """Unit direction from the middle of a mesh to a camera."""
-    return normalize(camera.position[0] - vertices.mean(0), dim=-1)
+def texel_places(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    uv: Float[Tensor, "vertex 2"],
+    side: int,
+) -> tuple[Float[Tensor, "side side 3"], Float[Tensor, "side side 3"]]:
+    """Place and unit normal of each texel on a mesh. Texels between charts are those of the nearest one, for lookups
+    across its edge."""
+    plane = torch.cat([uv * side, torch.ones_like(uv[:, :1])], -1)
+    places, _, found = kernels.rasterize_mesh(plane, vertices, faces, (side, side))
+    row, column = torch.from_numpy(
+        distance_transform_edt((found < 0).numpy(), return_distances=False, return_indices=True)
+    )
+    a, b, c = vertices[faces].unbind(1)
+    normals = normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    return places[row.long(), column.long()], normals[found[row.long(), column.long()].long()]
 
 
 def unwrapped(
-    photograph: Photograph, grid: Float[Tensor, "rows columns 3"], faces: Int[Tensor, "face 3"], side: int
+    photograph: Photograph,
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    place: Float[Tensor, "side side 3"],
+    normal: Float[Tensor, "side side 3"],
 ) -> tuple[UInt8[Tensor, "3 side side"], Bool[Tensor, "1 side side"]]:
-    """A photograph as the texture of a mesh: colours of the texels that it shows, and which these are."""
-    camera = photograph.camera
-    centre = (torch.arange(side) + 0.5) / side
-    v, u = torch.meshgrid(centre, centre, indexing="ij")
-    rows, columns, _ = grid.shape
-    at = torch.stack([u, v], -1)[None] * 2 - 1  # from the first vertex to the last
-    place = grid_sample(grid.movedim(-1, 0)[None], at, align_corners=True)[0].movedim(0, -1)
-    right, down = (place.roll(-1, axis) - place.roll(1, axis) for axis in (1, 0))
-    normal = normalize(torch.linalg.cross(down, right), dim=-1)
+    """A photograph as the texture of a mesh: colours of the texels that it shows, and which these are.
+
+    place, normal: of texels, see `texel_places`
+    """
+    camera, side = photograph.camera, len(place)
     to_camera = camera.position[0] - place
     away = to_camera.norm(dim=-1)
     facing = (normal * to_camera).sum(-1) / away
     pixels, valid = camera.project(place.view(-1, 3))
-    distance = mesh_distance(grid.view(-1, 3), faces.int(), camera)
+    distance = mesh_distance(vertices, faces.int(), camera)
     height, width = shape(camera)
     column, row = pixels.nan_to_num().floor().long().unbind(-1)
     inside = valid & (column >= 0) & (row >= 0) & (column < width) & (row < height)

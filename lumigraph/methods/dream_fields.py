@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -26,9 +26,12 @@ from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_f
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import LearningRate, Seed, Width, between, changed
+from ..files.ranges import LearningRate, Seed, Width, changed
 from ..method import FieldMethod, seeded
 from ..volume import composite
+
+FINAL_LEARNING_RATE = 1e-3  # learning rate at the end of the budget, reached exponentially
+DECAY_START = 0.3  # share of the budget before the learning rate falls
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,6 @@ class Config:
     distillation: DistillationNumbers = DistillationNumbers()
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher: faster, may diverge
-    final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another scene
 
 
@@ -103,7 +104,7 @@ class DreamFields(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Warm-up, then constant, then exponential decay."""
         c = self.config
-        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return hold_and_decay(c.learning_rate, FINAL_LEARNING_RATE, step, progress, DECAY_START)
 
 
 def rays_of(views: PromptedViews) -> Rays:

@@ -26,7 +26,7 @@ from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
-from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between, changed
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between, changed
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod, seeded
@@ -47,6 +47,9 @@ WEIGHT_THRESHOLD = 1e-4  # weight of a sample below which it gets no colour in t
 FINAL_LEARNING_RATE = 0.1  # share of these rates at the end of the budget, section 6.1
 TV_INTERVAL = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
 
+FEATURE_CHANNELS = 12  # channels of a corner, 6.1; the first 3 are a colour
+HIDDEN_LAYERS = 2  # hidden layers of the colour network, section 6.1
+
 
 @dataclass(frozen=True)
 class Config:
@@ -57,9 +60,7 @@ class Config:
     measured: DepthNumbers = DepthNumbers()
     coarse_voxels: Voxels = 100**3  # voxels of the coarse stage, section 6.1; more cost memory and time
     voxels: Voxels = 160**3  # voxels of the fine stage at its end, section 6.1; more give detail, cost memory
-    feature_channels: Annotated[int, between(3, 64)] = 12  # channels of a corner, 6.1; the first 3 are a colour
     hidden_width: Width = 128  # channels of the colour network, section 6.1; wider costs time
-    hidden_layers: Layers = 2  # hidden layers of the colour network, section 6.1; more cost time
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
     coarse_share: Share = 0.2  # share of the budget of the coarse stage: 5 of the paper's 25 thousand steps
     doublings: Annotated[int, between(0, 12)] = 4  # doublings of the voxels in the fine stage, section 5.2; 0: none
@@ -113,8 +114,8 @@ class VoxelField(Field):
         box = [[-1.0] * 3, [1.0] * 3] if space.is_open else [list(corner) for corner in frame.bounds]
         finer = FLAT if isinstance(space, NDC) else (1.0, 1.0, 1.0)
         self.density_grid = VoxelGrid(box, c.coarse_voxels, 1, finer)
-        self.feature_grid = VoxelGrid(box, c.coarse_voxels, c.feature_channels, finer)
-        self.colour_network = MLP(c.feature_channels + c.sh_bands**2, *[c.hidden_width] * c.hidden_layers, 3)
+        self.feature_grid = VoxelGrid(box, c.coarse_voxels, FEATURE_CHANNELS, finer)
+        self.colour_network = MLP(FEATURE_CHANNELS + c.sh_bands**2, *[c.hidden_width] * HIDDEN_LAYERS, 3)
         self.register_buffer("stage", torch.tensor(0))
         sides = [high - low for low, high in zip(*box, strict=True)]
         self.register_buffer("edge", torch.tensor((math.prod(sides) / c.coarse_voxels) ** (1 / 3)))
@@ -187,14 +188,14 @@ class DVGO(FieldMethod):
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
         return changed(Config(), samples_per_step=4096, occupancy_resolution=16, coarse_voxels=16**3, voxels=24**3,
-            feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096,
+            hidden_width=16, sh_bands=2, open_samples_per_step=4096,
             density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2, doublings=2,
             growing_share=0.5)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         """The finest grids; while they learn also their gradient and two moments."""
-        numbers = config.voxels * (1 + config.feature_channels)
+        numbers = config.voxels * (1 + FEATURE_CHANNELS)
         return super().further_bytes(frame, config, learning) + 4 * numbers * (4 if learning else 1)
 
     # Training
@@ -336,7 +337,7 @@ class DVGO(FieldMethod):
         points = space.unwarp(places[there])
         stretch = space.stretch(points) if space.is_open else points.new_ones(len(points))
         thickness = known.density_around(points, edge / stretch, chance) / stretch * edge
-        raw, features = torch.full((len(places), 1), TEACHER_EMPTY), torch.zeros(len(places), c.feature_channels)
+        raw, features = torch.full((len(places), 1), TEACHER_EMPTY), torch.zeros(len(places), FEATURE_CHANNELS)
         shift = network.shift(int(network.stage))
         raw[there] = (inverse_softplus(thickness)[:, None] - shift).clamp_min(TEACHER_EMPTY)
         features[there, :3] = known.harmonics(points, 1, logit)[:, 0] * K00

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -21,10 +21,13 @@ from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame
 from ..exchange.packing import most_important
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width
 from ..method import FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..volume import composite
+
+FINAL_LEARNING_RATE = 1e-3  # learning rate at the end of the budget, reached exponentially
+DECAY_START = 0.3  # share of the budget before the learning rate falls
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,6 @@ class Config:
     measured: DepthNumbers = DepthNumbers()
     hidden_width: Width = 64  # neurons of a hidden layer, section 5.4; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first, section 4; higher: faster, may diverge
-    final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from squared to linear; 1: always squared
     contraction: bool = True  # contract open captures and sample by proposals (Barron 2022); off: cascades, 5.4
@@ -95,7 +96,7 @@ class InstantNGP(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
-        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return hold_and_decay(c.learning_rate, FINAL_LEARNING_RATE, step, progress, DECAY_START)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Table and networks, taught at points by the teacher."""

@@ -24,7 +24,7 @@ from ..components.sampling.samplers import sampling_bytes
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
-from ..files.ranges import Layers, NonNegative, PositiveShare, Seed, Share, Width, changed
+from ..files.ranges import Layers, PositiveShare, Seed, Share, Width, changed
 from ..method import FieldMethod, Pass, seeded
 from ..method.controls import AVERAGE, Control
 from ..method.field import Densities, Points
@@ -117,6 +117,9 @@ def opaque(thickness: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
     return -torch.expm1(-thickness)
 
 
+TRANSIENT_WEIGHT = 0.01  # lambda_u, weight of transient density, section 5
+
+
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers, with NeRF's learning rates; `NeRFW.preset` has those of a plain CPU."""
@@ -128,7 +131,6 @@ class Config:
     transient_layers: Layers = 4  # hidden layers of the transient head, supplement; more cost time
     transient_width: Width = 128  # channels of the transient head, supplement; wider costs time
     beta_min: PositiveShare = 0.03  # least uncertainty, section 5; higher gives uncertain pixels more weight
-    transient_weight: NonNegative = 0.01  # lambda_u, weight of transient density, section 5; higher: less transient
     transient_start: Share = 0.0  # share of the budget before the transient part is on; later: more is static
     own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -202,7 +204,7 @@ class NeRFW(FieldMethod):
             seen = with_transient(look, passing, background)
             beta = c.beta_min + seen.extra["beta"]
             terms["uncertainty"] = (beta / c.beta_min).log().mean()
-            terms["transient"] = c.transient_weight * mean_along(last.samples, passing.density)
+            terms["transient"] = TRANSIENT_WEIGHT * mean_along(last.samples, passing.density)
         error = squared(seen.rgb - target)
         terms["colour"] = (error / (2 * beta.square())).mean()
         certain = 1 / (2 * c.beta_min**2)  # largest weight of an error, to which the other terms are relative

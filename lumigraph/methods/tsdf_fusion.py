@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Photograph, Scene
-from ..depth_maps import DepthMap, VoxelBlocks, render_depth_maps, sensor_faults, trust_of
+from ..depth_maps import DepthMap, VoxelBlocks, release_weight, render_depth_maps, sensor_faults, trust_of
 from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import NonNegative, Positive, Seed, between
+from ..files.ranges import NonNegative, Positive, Seed, Share, between
 from ..method import Descend, RayMethod
 from ..system.memory import free_memory
 
@@ -30,6 +30,7 @@ MEMORY_SHARE = 0.5  # of the free memory that blocks may fill: growing copies th
 PRUNE_EVERY = 32  # depth maps between two searches for blocks that show no surface
 TEACHER_VIEWS = 100  # depth maps of a method that is converted, at most
 TEACHER_SIZE = 640  # pixels of their longer side
+SAMPLE_WEIGHT, SENSOR_SPAN = 3.0, (0.4, 4.0)  # of the release's weight: that of one sample, and metres
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,16 @@ class Config:
 
     voxel_size: Length = 0.004  # edge of a voxel, in units of the capture (metres); 0: a 256th of the box of interest
     truncation: Annotated[float, between(2, 64)] = 5.0  # voxels before and behind a surface; more bears more noise
+    truncation_growth: Share = 0.01  # truncation added for each unit of depth; more bears more noise far away
+    weighting: Literal["depth", "angle"] = "depth"  # weight of a pixel: the release's, by depth; or by viewing angle
     max_weight: Positive = 255.0  # of a voxel's mean; less follows changes sooner
-    max_depth: Length = 4.0  # in units of the capture, beyond which depth is left out; 0: none
-    trusted_depth: Length = 0.0  # in units of the capture, up to which depth counts in full; 0: everywhere
+    max_depth: Length = 3.0  # in units of the capture, beyond which depth is left out; 0: none
+    trusted_depth: Length = 0.0  # units of the capture to which depth counts in full, weighted by angle; 0: all
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+BY_ANGLE = Config(truncation=4.0, truncation_growth=0.0, weighting="angle", max_depth=0.0)  # for any unit and range
 
 
 class TSDFFusion(RayMethod):
@@ -68,24 +74,24 @@ class TSDFFusion(RayMethod):
                 "capture; give --voxel-size in its unit, or 0 for a 256th of the box"
             )
         most = int(MEMORY_SHARE * free_memory() / BYTES_PER_BLOCK)
-        self.volume = VoxelBlocks(edge, c.truncation, c.max_weight, max(most, 1))
+        self.volume = VoxelBlocks(edge, c.truncation, c.max_weight, max(most, 1), c.truncation_growth)
         self.register_buffer("fused", torch.tensor(0))
         self.register_buffer("count", torch.tensor(-1))
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """Voxels of a centimetre; depth beyond 3 m counts by its inverse variance."""
-        return Config(voxel_size=0.01, truncation=4.0, max_depth=0.0, trusted_depth=3.0)
+        return replace(BY_ANGLE, voxel_size=0.01, trusted_depth=3.0)
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
         """Voxels by the box of interest: the unit of photographs is arbitrary."""
-        return Config(voxel_size=0.0, truncation=4.0, max_depth=0.0)
+        return replace(BY_ANGLE, voxel_size=0.0)
 
     @classmethod
     def smallest(cls) -> Any:
         """Some thousand voxels."""
-        return Config(voxel_size=0.08, truncation=3.0, max_depth=0.0)
+        return replace(BY_ANGLE, voxel_size=0.08, truncation=3.0)
 
     # Learning
 
@@ -122,7 +128,11 @@ class TSDFFusion(RayMethod):
 
     def _fuse(self, seen: DepthMap, mask: Tensor | None = None) -> None:
         c = self.config
-        trust = trust_of(seen, c.trusted_depth * self.unit, (c.max_depth or math.inf) * self.unit)
+        farthest = c.max_depth or math.inf
+        if c.weighting == "depth":
+            trust = release_weight(seen, self.unit, SAMPLE_WEIGHT, SENSOR_SPAN, farthest)
+        else:
+            trust = trust_of(seen, c.trusted_depth * self.unit, farthest * self.unit)
         if mask is not None:
             trust = trust * mask.to(trust)
         if not self.volume.fuse(seen, trust):

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from ..color.srgb import srgb_from_linear
 from ..files.exr import picture_of, read_exr
-from ..files.ffmpeg import decode
 from ..system.memory import free_memory
 
 Tag = ExifTags.Base
@@ -172,7 +172,8 @@ def read_numbers(path: Path, name: str = "") -> np.ndarray:
     kind, tiff = kind_of(path), is_tiff(path)
     of_pillow = kind.channels == 1 and kind.dtype.kind in "fi"  # unknown to FFmpeg, or of another order there
     if kind.deep and not of_pillow:
-        return decode(path).astype(kind.dtype)
+        with open(path, "rb") as file, av.open(file, "r") as container:
+            return next(container.decode(video=0)).to_ndarray().astype(kind.dtype)
     with Image.open(path) as image:
         image.load()  # turns a TIFF upright, which np.asarray would not notice
         values = np.asarray(image).astype(kind.dtype)

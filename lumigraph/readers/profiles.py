@@ -21,8 +21,6 @@ SPACES = {"RGB ": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab ": "LAB"}  # Pillow's
 FROM_ICC = np.linalg.inv(  # XYZ of ICC's white, D50, to linear sRGB
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
-_made = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
-SRGB_PROFILE = bytes(_made[:24] + struct.pack(">6H", 2020, 1, 1, 0, 0, 0) + _made[36:])  # of one date, for equal files
 NCLX, CICP = b"colrnclx", b"cICP"  # boxes of HEIF and AVIF, chunks of PNG
 PLACES = {
     "AVIF": (NCLX, ">HH"),

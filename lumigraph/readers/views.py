@@ -48,13 +48,9 @@ def with_train(scene: Scene, train: Int[Tensor, " image"]) -> Scene:
 def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:
     """Order of cameras by farthest-point sampling, every prefix of which is spread evenly (Gonzalez 1985).
 
-    The first is the one nearest the mean. Distance is that of positions, in units of their deviation, and of viewing
-    directions. Among equals the first comes first.
+    The first is the one nearest the mean. Distance is that of `pose_points`. Among equals the first comes first.
     """
-    position, direction = cameras.position, cameras.pose[:, :, 2]
-    centred = position - position.mean(0)
-    deviation = centred.square().sum(-1).mean().sqrt().clamp_min(1e-9)
-    points = torch.cat([centred / deviation, direction], -1)
+    points = pose_points(cameras)
     order = [int(distances(points, points.mean(0)).argmin())]
     nearest = distances(points, points[order[0]])
     while len(order) < len(points):
@@ -62,6 +58,14 @@ def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:
         order.append(int(nearest.argmax()))
         nearest = torch.minimum(nearest, distances(points, points[order[-1]]))
     return torch.tensor(order)
+
+
+def pose_points(cameras: Camera) -> Float[Tensor, "camera 6"]:
+    """Positions, in units of their deviation, and viewing directions of cameras, between which distances are taken."""
+    position, direction = cameras.position, cameras.pose[:, :, 2]
+    centred = position - position.mean(0)
+    deviation = centred.square().sum(-1).mean().sqrt().clamp_min(1e-9)
+    return torch.cat([centred / deviation, direction], -1)
 
 
 def distances(points: Float[Tensor, "point axis"], origin: Float[Tensor, " axis"]) -> Float[Tensor, " point"]:

@@ -16,7 +16,20 @@ from .. import files, methods
 from ..budget import Budget
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, format_value, hints, numbers, typed, value_of
+from ..files.ranges import (
+    Count,
+    Downscale,
+    Name,
+    Scales,
+    Tally,
+    between,
+    format_value,
+    groups_of,
+    hints,
+    numbers,
+    typed,
+    value_of,
+)
 from ..files.reading import reads
 from ..method import Method
 from ..readers import CapturePart, Unposed
@@ -115,14 +128,19 @@ class Settings:
 
 def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
     """JSON of a Config, each option at its place in this version; no two options of a Config have one name. What is a
-    constant now, by its name in capitals beside the Config or a part of it, is left out, with a warning of another
-    value."""
+    constant now, by its name in capitals beside the Config or a part of it, or follows from other options, as a
+    property, is left out, with a warning of another value."""
     parts = [*parts_of(kind)]
     modules = [vars(sys.modules[part.__module__]) for part in parts]
     known = {name: held for part in parts for name, held in hints(part).items()}
 
     def constants(name: str) -> list[Any]:
         return [module[name.upper()] for module in modules if name.upper() in module and name not in known]
+
+    def following(name: str) -> list[Any]:
+        if not any(isinstance(getattr(part, name, None), property) for part in parts):
+            return []
+        return [getattr(x, name) for x in groups_of(typed(kind, made, file)) if hasattr(x, name)]
 
     def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         for name, value in said.items():
@@ -137,7 +155,7 @@ def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[s
     found = dict(leaves(said))
     made = placed(kind)
     for name, value in found.items():
-        if not (values := constants(name)):
+        if not (values := constants(name) or following(name)):
             made[name] = value
         elif value not in map(msgspec.to_builtins, values):
             was, now = format_value(value), format_value(values[0])

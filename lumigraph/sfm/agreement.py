@@ -19,6 +19,9 @@ from .diagnosis import MIN_MATCHES, Matches
 
 MAX_PAIRS = 4000  # pairs of photographs that are looked at
 MAX_EPIPOLAR_ERROR = 0.003  # distance from the epipolar line, of a photograph's longer side
+MAX_STILL_MOTION = 0.003  # of a feature that stays where it is in the picture, of its longer side
+MIN_CAMERA_TURN = 4.0  # degrees between two cameras, from which what they look at should move in the picture
+MIN_STILL_MATCHES = 15  # matches of two photographs that stay where they are and contradict the cameras
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,31 @@ def agreement(model: pycolmap.Reconstruction, database: Path, matched: Matches) 
         if first is not None and second is not None:
             confirmed += int(on_epipolar_lines(model, first, second, features[a], features[b], pair).sum())
     return Agreement(matches, confirmed)
+
+
+def still_share(model: pycolmap.Reconstruction, database: Path) -> float:
+    """Share of the pairs of cameras turned apart whose pictures have matches at the same place that contradict the
+    cameras: the background of a subject that was turned before a camera at rest. Verification leaves such matches out.
+    """
+    placed = {image.image_id: image for image in model.images.values() if image.has_pose}
+    turned = still = 0
+    with closing(pycolmap.Database.open(database)) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        own = {image.name: image for image in placed.values()}
+        features = {number: opened.read_keypoints(number)[:, :2] for number, name in names.items() if name in own}
+        pairs = [pycolmap.pair_id_to_image_pair(number) for number in opened.read_two_view_geometries()[0]]
+        for a, b in evenly([pair for pair in pairs if set(pair) <= features.keys()], MAX_PAIRS):
+            first, second = own[names[a]], own[names[b]]
+            motion = second.cam_from_world() * first.cam_from_world().inverse()
+            if np.degrees(motion.rotation.angle()) < MIN_CAMERA_TURN:
+                continue
+            pair = opened.read_matches(a, b)
+            side = max(model.cameras[first.camera_id].width, model.cameras[first.camera_id].height)
+            moved = np.linalg.norm(features[a][pair[:, 0]] - features[b][pair[:, 1]], axis=1)
+            pair = pair[moved < MAX_STILL_MOTION * side]
+            against = ~on_epipolar_lines(model, first, second, features[a], features[b], pair) if len(pair) else pair
+            turned, still = turned + 1, still + (int(np.sum(against)) >= MIN_STILL_MATCHES)
+    return still / turned if turned else 0.0
 
 
 def on_epipolar_lines(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,7 @@ MIRRORED_PSNR = 1.5  # dB by which a mirrored photograph must fit its rendering 
 BLURRED = "blurred"  # fault of a photograph
 FOLDED = "folded cameras"  # fault of a capture whose cameras leap where its photographs do not
 LACKING = "lacking directions"  # fault of a capture with directions that lack photographs
+TURNING = "turning subject"  # fault of a capture whose subject turned before a background at rest
 
 Array = Float[np.ndarray, " photo"]
 
@@ -74,6 +75,7 @@ class Residual:
     psnr:     dB, after a gain and an offset per colour
     mirrored: the same of the mirrored photograph
     floating: share of its rendered surface that other cameras see through (floaters)
+    baselines: psnr of trivial stand-ins for a held-out photograph
     """
 
     photograph: str
@@ -81,6 +83,7 @@ class Residual:
     psnr: float
     mirrored: float
     floating: float
+    baselines: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

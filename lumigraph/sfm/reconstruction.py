@@ -26,7 +26,7 @@ from ..readers.transforms import read as read_transforms
 from ..system.library import pycolmap
 from ..system.memory import free_memory
 from ..system.progress import counting, tell
-from .agreement import Agreement, agreement
+from .agreement import Agreement, agreement, still_share
 from .demand import demand_of, fitted, reduced_pixels
 from .diagnosis import (
     ALL_TURNED_SHARE,
@@ -38,7 +38,7 @@ from .diagnosis import (
     read_matches,
     triangulation_angle,
 )
-from .doctor import FOLDED, findings
+from .doctor import FOLDED, TURNING, Finding, findings
 from .drawings import draw_capture, draw_photographs
 from .folder import (
     DRAWING_FILES,
@@ -73,6 +73,7 @@ PIXELS_PER_FEATURE = 150  # of a photograph that may have its features without t
 MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
 SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
+MIN_STILL_SHARE = 0.3  # share of pairs with a background at rest, from which on the subject turned
 MIN_AGREEMENT = 0.8  # share of the matches, below which photographs are placed in other ways too
 NOTE_FILE = "note.txt"  # beside models that were made in another way than was asked for: why, in a sentence
 OTHER_SEEDS = 1, 2
@@ -523,6 +524,10 @@ class Reconstruction:
         draw_photographs(photograph_sheet, self.intake, diagnosis)
         found = findings(read_transforms(self.folder), diagnosis.left_out, judged=self.photos)
         told_once = [asdict(finding) for finding in found if finding.fault != FOLDED]  # the warnings know, by matches
+        if not self.spherical and (still := still_share(model, used)) > MIN_STILL_SHARE:
+            evidence = f"in {still:.0%} of the pairs of photographs the background is at rest while the subject turns"
+            advice = "train on the subject alone, by the masks of `lumigraph capture --mask-object`"
+            told_once.append(asdict(Finding("", TURNING, evidence, advice)))
         result = self.summary(key, model, place, diagnosis) | {"findings": told_once}
         write_json(self.folder / RESULT_FILE, result, "capture")
         return read_json(self.folder / RESULT_FILE)

@@ -21,6 +21,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
+from ..color.tags import save_srgb
 from ..files import replacing
 from ..geometry import evenly
 from ..readers.pictures import read_image
@@ -57,7 +58,7 @@ def stitch(database: Path, images: Path, target: Path) -> int:
     width = min(MAX_WIDTH, 2 * round(math.pi * ratio * max(max(sizes[i]) for i in rotations)))
     picture = blended({images / names[i]: turn for i, turn in rotations.items()}, ratio, width)
     with replacing(target, "capture") as partial:
-        Image.fromarray(picture).save(partial, "JPEG", quality=JPEG_QUALITY)
+        save_srgb(Image.fromarray(picture), partial, "JPEG", quality=JPEG_QUALITY)
     return len(rotations)
 
 

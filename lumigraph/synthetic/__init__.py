@@ -13,6 +13,7 @@
     open_scene("procedural:walker,jitter_bones=5")        a character and its skeleton, with bone errors of 5 degrees
     open_scene("procedural:character,file=fox.glb")       the same of a skinned mesh
     open_scene("procedural:room,depth,views=300")         a depth camera's film, in metres; `exact_depth` is the truth
+    open_scene("procedural:room,depth,holes=grid,step=5") less kind data; see `nuisances`
 
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
     open_dataset("procedural:toys,count=20,turned=1")     the same, each in a random pose
@@ -37,10 +38,12 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Pinhole
+from ..color.tags import save_srgb
 from ..datasets.world import BlockLabels
 from ..geometry import Similarity
 from ..readers.capture import Capture, PixelPlane, Shot
 from ..readers.raw import RawPhoto, facts, planes
+from ..readers.unposed import TRUE_POSE
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
@@ -50,6 +53,7 @@ from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage
 from .members import members_of as members_of
+from .nuisances import disturbed, staged
 from .rendering import eight_bits, open_sky, photograph, radiance, roughness
 from .rendering import lit as lit
 from .rendering import render as render
@@ -57,8 +61,8 @@ from .rendering import scattered as scattered
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
 from .rendering import unoccluded as unoccluded
+from .stage import Nuisances, nuisances_of, told
 from .stage import SyntheticStage as SyntheticStage
-from .stage import told
 from .world import Fog as Fog
 from .world import Lamp as Lamp
 from .world import Material as Material
@@ -69,7 +73,6 @@ from .world import Sun as Sun
 from .world import World as World
 from .world import rotation_about
 
-TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to the source's; see `Stage.turn`
 TRACER = 1  # of the pictures that are kept: another number traces them anew
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,15 +95,22 @@ def read(request: str) -> Capture:
 
     Pictures are rendered when they are read. Raises LumigraphError for an unknown name or option.
     """
-    if is_category(request):
-        return capture(member_stage(request), f"procedural:{request}", kept=True)
-    name, options = told(scenes.options(request.partition(",")[0]), request)
+    plain, disturbances = nuisances_of(request)
+    nuisances = told(Nuisances, ",".join([plain.partition(",")[0], *disturbances]))[1]
+    return disturbed(undisturbed(plain, request, nuisances), nuisances)
+
+
+def undisturbed(plain: str, request: str, nuisances: Nuisances) -> Capture:
+    """The capture of a name with options but nuisances, of which those of the stage are in the world already."""
+    if is_category(plain):
+        return capture(staged(member_stage(plain), nuisances), f"procedural:{request}", kept=True)
+    name, options = told(scenes.options(plain.partition(",")[0]), plain)
     asked = asdict(options)
     amount = asked.pop("jitter_poses")
-    stage = scenes.stage(name, **asked)
+    stage = staged(scenes.stage(name, **asked), nuisances)
     off = jittered(stage, amount, options.seed) if amount else None
     found = capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
-    if is_block_world(request):
+    if is_block_world(plain):
         found = replace(found, blocks=blocks_about_middle(scenes.scene(name).blocks(options)))
     return found
 
@@ -311,7 +321,7 @@ def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> No
             seen = render(stage.world_of(cameras[i]), cameras[i])
             path = f"{split}/r_{i:04d}"
             pixels = eight_bits(seen.rgb.numpy(), seen.opacity.numpy(), alpha=not stage.world.sky.visible)
-            Image.fromarray(pixels).save(folder / f"{path}.png")
+            save_srgb(Image.fromarray(pixels), folder / f"{path}.png")
             if truth:
                 known = {k: v.numpy() for k, v in (("depth", seen.depth), *seen.extra.items())}
                 known["names"] = np.array(stage.world.names)

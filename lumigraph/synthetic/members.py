@@ -23,7 +23,7 @@ from . import categories, scenes
 from .cameras import dome, pinhole, spiral
 from .categories import FIELD_OF_VIEW, surrounded
 from .shapes import triangle_of
-from .stage import SyntheticStage, told
+from .stage import SyntheticStage, nuisances_of, told
 from .textures import Plain
 from .world import Material, Object, Pose, Vector, nested
 
@@ -82,9 +82,10 @@ def is_collection(request: str) -> bool:
 
 def members_of(request: str) -> dict[str, str]:
     """Request for each member, by name. Raises LumigraphError for a folder without meshes."""
-    name, many = told(Many, request)
+    plain, disturbances = nuisances_of(request)
+    name, many = told(Many, plain)
     said = {key: value for key, value in asdict(many).items() if key != "count" and (key != "turned" or value)}
-    shared = ",".join(f"{key}={value}" for key, value in said.items())
+    shared = ",".join([*(f"{key}={value}" for key, value in said.items()), *disturbances])
     if (folder := path_of(request)) is None:
         return {f"{name}-{i:04d}": f"{name},member={i},{shared}" for i in range(many.count)}
     found = sorted(filter(meshes.is_mesh, folder.resolve().rglob("*")), key=lambda path: natural(path.as_posix()))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 from ..camera import Camera
 from ..datasets.skeleton import Skeleton
 from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
-from ..files.ranges import Seed, between, typed
+from ..files.ranges import Seed, between, numbers, typed
 from ..geometry import evenly
 from .depth_camera import DepthCamera
 from .sensor import Sensor
@@ -96,23 +96,71 @@ class Pictures:
     jitter_poses: Annotated[int, between(0, 45)] = 0
 
 
+@dataclass(frozen=True)
+class Nuisances:
+    """Options of every scene that make it like data that nobody made for a method, each off by default.
+
+    shape: seed of a random object in place of the scene's, with a hole, thin rods and a hollow base
+    open: distance of a background behind the cameras, scene units; clutter: number of small things near cameras
+    turntable: the background goes with the camera, as where the object turns; backdrop: a board that is carried round
+    step: one of so many training photographs in turn is kept; few: so many, evenly spread; order: shuffled names
+    poses: error of training poses, pixels; blur: of moved cameras, pixels
+    exposure: stops up or down; white_balance: percent
+    holes: unknown pixels of measured depth; noise: errors of it
+    labels: percent of wrong pixels, and of photographs without labels
+    scale: unit of the source; offset: of its origin along each axis
+    """
+
+    shape: Seed = 0
+    open: Annotated[float, between(0, 1e4)] = 0.0
+    clutter: Annotated[int, between(0, 1000)] = 0
+    turntable: Flag = 0
+    backdrop: Flag = 0
+    step: Annotated[int, between(1, 1000)] = 1
+    few: Annotated[int, between(0, 10_000)] = 0
+    order: Flag = 0
+    poses: Annotated[float, between(0, 100)] = 0.0
+    blur: Annotated[float, between(0, 100)] = 0.0
+    exposure: Annotated[float, between(0, 8)] = 0.0
+    white_balance: Annotated[float, between(0, 90)] = 0.0
+    holes: Literal["", "grid", "columns", "borders", "far"] = ""
+    noise: Literal["", "quantised", "scaled", "returns"] = ""
+    labels: Annotated[float, between(0, 100)] = 0.0
+    scale: Annotated[float, between(1e-6, 1e6)] = 1.0
+    offset: Annotated[float, between(-1e7, 1e7)] = 0.0
+
+
+def nuisances_of(request: str) -> tuple[str, list[str]]:
+    """The request without its nuisances, and these as they are written."""
+    name, *rest = request.split(",")
+    known = {field.name for field in fields(Nuisances)}
+    own = [text for text in rest if text.strip().partition("=")[0] in known]
+    return ",".join([name, *(text for text in rest if text not in own)]), own
+
+
 def told(kind: type[Options], request: str) -> tuple[str, Options]:
     """Parse a name with options to the name and a dataclass. Raises LumigraphError for an unknown option."""
     name, *rest = request.split(",")
     return name, typed(kind, dict(parse(kind, request, text) for text in rest), f"procedural:{request}")
 
 
-def parse(kind: type, request: str, text: str) -> tuple[str, int | str]:
-    """One option, "size=400" or "file=fox.glb", or a flag, "depth"."""
+def parse(kind: type, request: str, text: str) -> tuple[str, float | str]:
+    """One option, "size=400", "scale=0.01" or "file=fox.glb", or a flag, "depth"."""
     name, equals, value = text.strip().partition("=")
     known = [field.name for field in fields(kind)]
     if name not in known:
+        known += [] if kind is Nuisances else [field.name for field in fields(Nuisances)]
         raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
     meant = get_type_hints(kind, include_extras=True)[name]
     if not equals and meant == Flag:
         return name, 1
-    if meant is str:
+    if meant is str or get_origin(meant) is Literal:
         return name, value
+    if next(numbers(meant))[0] is float:
+        try:
+            return name, float(value)
+        except ValueError as error:
+            raise LumigraphError(f"procedural:{request}: {name} must be a number; got {value!r}") from error
     if not value.isdecimal() or len(value) > MAX_DIGITS:
         raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
     return name, int(value)

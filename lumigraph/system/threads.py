@@ -34,8 +34,10 @@ def settle(environment: MutableMapping[str, str] = os.environ) -> None:
     """Set the spin count of threads, unless the environment sets their wait policy.
 
     It applies to libraries that are loaded afterwards: to PyTorch and Numba, or to Numba alone where PyTorch was
-    imported before Lumigraph.
+    imported before Lumigraph. Numba prefers OpenMP to TBB, which some package may have brought: that would be a second
+    pool, and at exit it waits for its threads, for minutes on a loaded machine.
     """
+    environment.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
     if not any(name in environment for name in USER_SETTINGS):
         environment["GOMP_SPINCOUNT"] = str(SPIN_COUNT)
 

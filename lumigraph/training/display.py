@@ -227,8 +227,8 @@ def machine(device: torch.device) -> str:
 
 
 def how_long(budget: Budget, step: int, seconds: float) -> str:
-    """Remaining budget. The time of a step is known only after some steps."""
+    """Remaining budget. The time of a step is known only after some steps, and the beginning may have spent all."""
     if budget.steps is None:
-        return f"for {lasting(budget.total - seconds)}"
+        return f"for {lasting(left)}" if (left := budget.total - seconds) > 0 else "without a step of learning"
     done = f", {step:,} of them done" if step else ""
     return f"for {budget}{done}; how long they take is told once a few are done"

@@ -50,16 +50,12 @@ class AdaptiveDensity(DensityControl):
 
     def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
         super().begin_cloud(cloud, views, chance)
-        self.forget(len(cloud))
-
-    def forget(self, count: int) -> None:
-        """Reset the sums, for a cloud of `count` Gaussians."""
         for name in self.grows:
-            setattr(self, name, getattr(self, name).new_zeros(count))
+            setattr(self, name, getattr(self, name).new_zeros(len(cloud)))
 
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
         for name in self.grows:
-            setattr(self, name, getattr(self, name)[keep])
+            setattr(self, name, getattr(self, name)[source])
 
     def storage(self) -> dict[str, Stored]:
         return dict.fromkeys(self.grows, Stored("nothing"))
@@ -119,7 +115,8 @@ class AdaptiveDensity(DensityControl):
         split = halves[source]  # the original of a split is the other half
         cloud.rebuild(source, fresh | split)
         scatter(cloud, split, generator)
-        self.forget(len(cloud))
+        for name in self.grows:
+            getattr(self, name).zero_()
         return full
 
     @torch.no_grad()

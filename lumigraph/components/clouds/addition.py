@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera import Camera
@@ -51,7 +51,7 @@ class Step:
     background: behind everything, one colour or one for each pixel
     target:     colours that the loss compares with
     residual:   rgb - target before pixels are left out
-    learnt:     the parameters;  prune: leaves the Gaussians of a mask of them
+    learnt:     the parameters
     progress:   share of the budget spent;  drawn: number of photographs that were learnt from
     bands:      of the harmonics in use
     moment:     of the photograph, in a scene that moves
@@ -66,7 +66,6 @@ class Step:
     cloud: Gaussians
     camera: Camera
     learnt: Cloud
-    prune: Callable[[Bool[Tensor, " gaussian"]], None]
     views: TrainingViews
     number: int
     refining: torch.Generator
@@ -106,8 +105,8 @@ class Addition(Part):
     def begin_scene(self, cloud: Cloud, views: TrainingViews, data: Scene, sweep: Callable[[], Points]) -> None:
         """Initialise from the photographs. sweep: gives points that plane sweeps find"""
 
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        """Update after pruning to the Gaussians of a mask, or of indices."""
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
+        """Follow a change of the cloud: Gaussian i is, or was made of, the former Gaussian source[i]."""
 
     def filtered(self, cloud: Gaussians) -> Gaussians:
         """The cloud with filters, as it is rasterised in training and rendering."""

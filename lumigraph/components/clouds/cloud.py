@@ -59,6 +59,7 @@ class Cloud(Part):
     view_bits: a bit for each photograph in which a Gaussian was visible, see `view_count`
     extent:    of the cameras, in scene units
     optimizer: updates the parameters, and is resized with them; None before training
+    source:    former index of each Gaussian, if `rebuild` has changed them since `follow_rebuilds`; else None
     """
 
     grows: ClassVar[tuple[str, ...]] = (*NAMES, "view_bits")  # a saved one may be of another size
@@ -71,6 +72,7 @@ class Cloud(Part):
     view_bits: Tensor
     extent: Tensor
     optimizer: CloudAdam | None = None
+    source: Int[Tensor, " gaussian"] | None = None
 
     def __init__(self, gaussians: Gaussians, rates: RateNumbers = RateNumbers(), most_haste: float = MOST_HASTE):
         super().__init__()
@@ -117,6 +119,7 @@ class Cloud(Part):
     @torch.no_grad()
     def replace(self, gaussians: Gaussians) -> None:
         """Replace the cloud, with fresh moments."""
+        self.source = None
         for name in NAMES:
             exchange(self, name, getattr(gaussians, name).detach().clone(), self.optimizer)
         self.view_bits = self.view_bits.new_zeros(len(gaussians))
@@ -137,6 +140,7 @@ class Cloud(Part):
                     state[moment][fresh] = state["step"] if moment == "last" else 0
             exchange(self, name, old.data[source], self.optimizer, state)
         self.view_bits = self.view_bits[source]
+        self.source = source if self.source is None else self.source[source]
 
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
         """Keep the Gaussians of a mask, with their moments."""

@@ -193,7 +193,7 @@ class CloudMethod(Method, ABC):
         """A step that begins, on a photograph."""
         cloud, moment = self.filtered(), self.moment_of(photograph.camera)
         return Step(
-            photograph, self.random(~number), cloud, cloud, photograph.camera, self.cloud, self.prune, self.views,
+            photograph, self.random(~number), cloud, cloud, photograph.camera, self.cloud, self.views,
             number, self.random(number), self.progress, int(self.drawn), self.bands, moment,
             differ=self.appearance is not None and self.appearance.is_active,
             full_size=self.progress >= self.numbers.half_resolution_until)  # fmt: skip
@@ -239,6 +239,7 @@ class CloudMethod(Method, ABC):
             self.cloud.record_view(now.camera.image_index, now.picture.centres.grad.ne(0).any(-1))
         for part in self.additions:
             part.finish(now)
+            self.follow_rebuilds()
         super().after_step(step)
         self.figures |= {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
         self.current = None
@@ -247,8 +248,14 @@ class CloudMethod(Method, ABC):
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
         """Keep the Gaussians of a mask, with their moments in the optimizer."""
         self.cloud.prune(keep)
-        for part in self.additions:
-            part.prune(keep)
+        self.follow_rebuilds()
+
+    def follow_rebuilds(self) -> None:
+        """Make all additions follow the changes of the cloud since the last call."""
+        if (source := self.cloud.source) is not None:
+            self.cloud.source = None
+            for part in self.additions:
+                part.follow(source)
 
     # Rendering (section 6)
 
@@ -308,5 +315,5 @@ class CloudMethod(Method, ABC):
         cloud, kept = thinned(self.cloud.gaussians(), weights, share)
         self.cloud.replace(cloud)
         for part in self.additions:
-            part.prune(kept)
+            part.follow(kept)
         return {"cloud.harmonics": weights[kept]}

@@ -50,7 +50,7 @@ class Tidying(Addition):
             near = near_camera(distance, cloud.view_count, views.near)
             known = rules.prune_near and step.drawn >= PASSES_BEFORE_PRUNING * len(cameras)
             if known and near.any() and not near.all():
-                step.prune(~near)
+                cloud.prune(~near)
                 distance = distance[~near]
             cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent), *limits))
         if step.bands > 1 and rules.observed_harmonics:

@@ -20,6 +20,8 @@ from .hash_field import Joining
 from .layers import in_chunks
 from .spaces import Space
 
+DIRECTION_FREQUENCIES = 4  # L for directions, section 5.1
+
 Places = tuple[Tensor, ...]  # what is encoded: coordinates of points, or means and variances of frustums
 Activation = Callable[[Tensor], Tensor]
 
@@ -31,7 +33,6 @@ class NetworkNumbers:
     depth: Depth = 8  # hidden layers before density, appendix A; more hold more detail, and cost time
     skip_layer: Layers = 5  # layer whose activation the input is concatenated to again, figure 7
     position_frequencies: Octaves = 10  # L for positions, section 5.1; more give finer detail, and noise
-    direction_frequencies: Octaves = 4  # L for directions, section 5.1; more give sharper highlights
     bfloat16: bool = True  # multiply in bfloat16 where the processor is fast at it; off: float32, slower
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
@@ -92,7 +93,7 @@ class CoordinateField(Field):
         n = self.numbers
         return (
             FrequencyEncoding(3, n.position_frequencies, keep_input),
-            FrequencyEncoding(3, n.direction_frequencies, keep_input),
+            FrequencyEncoding(3, DIRECTION_FREQUENCIES, keep_input),
         )
 
     def encode(self, coordinates: Float[Tensor, "place 3"]) -> Float[Tensor, "place width"]:
@@ -236,7 +237,7 @@ class FrustumField(CoordinateField):
 
     def encodings(self, keep_input: bool) -> tuple[IntegratedEncoding, FrequencyEncoding]:
         n = self.numbers
-        return IntegratedEncoding(3, n.position_frequencies), FrequencyEncoding(3, n.direction_frequencies, base=1.0)
+        return IntegratedEncoding(3, n.position_frequencies), FrequencyEncoding(3, DIRECTION_FREQUENCIES, base=1.0)
 
     def encode(
         self, means: Float[Tensor, "place 3"], variances: Float[Tensor, "place 3"] | None = None

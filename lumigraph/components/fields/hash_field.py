@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ... import kernels
 from ...errors import LumigraphError
 from ...exchange.packing import Stored
-from ...files.ranges import Layers, between
+from ...files.ranges import between
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 from ..training.row_optimizers import LazyAdam
@@ -23,6 +23,8 @@ from .spaces import Space
 OPEN_RATE = 0.5  # of the table's learning rate, for networks in the open: at 1, one seed in three never learns a hue
 CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table
 DENSITY_LAYERS = 1  # hidden layers of the density network, section 5.4
+COLOUR_LAYERS = 2  # hidden layers of the colour network, section 5.4
+GEOMETRY_FEATURES = 16  # features from density to colour network, section 5.4
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
 Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully
@@ -66,20 +68,18 @@ class TableNumbers:
 class HashNumbers(TableNumbers):
     """Numbers of the hash table and of the networks behind it (section 5.4)."""
 
-    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4; more cost time
-    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands, section 5.4; 1: no view dependence
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
         """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
-        return 4 * samples * (self.width + hidden_width * (DENSITY_LAYERS + self.colour_layers))
+        return 4 * samples * (self.width + hidden_width * (DENSITY_LAYERS + COLOUR_LAYERS))
 
 
 # Tables for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
 CPU_LEVELS = TableNumbers(levels=8, features_per_level=4, log2_hashmap_size=17, max_resolution=512)
 CPU_TABLE = HashNumbers(**vars(CPU_LEVELS))
 TINY_LEVELS = TableNumbers(levels=4, log2_hashmap_size=11, base_resolution=4, max_resolution=32)
-TINY_TABLE = HashNumbers(**vars(TINY_LEVELS), geometry_features=8, sh_bands=2)
+TINY_TABLE = HashNumbers(**vars(TINY_LEVELS), sh_bands=2)
 
 
 def new_table(levels: kernels.HashLevels) -> nn.Parameter:
@@ -95,6 +95,7 @@ class HashField(Field):
     reach:   half-size of the cube of a bounded scene
     code:    width of a code, input of the colour beside the direction, such as an appearance embedding
     joining: coarse-to-fine weights of the levels; None for no schedule
+    layers:  hidden layers of the colour network
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class HashField(Field):
         reach: float,
         code: int = 0,
         joining: Joining | None = None,
+        layers: int = COLOUR_LAYERS,
     ):
         super().__init__()
         n = numbers
@@ -112,8 +114,8 @@ class HashField(Field):
         self.extent, finer = (1.0, OPEN_RESOLUTION) if space.is_open else (reach, reach)
         self.levels = n.levels_of(finer)
         self.table = new_table(self.levels)
-        self.density_network = MLP(n.width, *[hidden_width] * DENSITY_LAYERS, n.geometry_features)
-        self.colour_network = MLP(n.geometry_features + n.sh_bands**2 + code, *[hidden_width] * n.colour_layers, 3)
+        self.density_network = MLP(n.width, *[hidden_width] * DENSITY_LAYERS, GEOMETRY_FEATURES)
+        self.colour_network = MLP(GEOMETRY_FEATURES + n.sh_bands**2 + code, *[hidden_width] * layers, 3)
 
     def encode(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
         """Features of all levels, the coarsest first."""

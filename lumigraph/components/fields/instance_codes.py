@@ -68,7 +68,7 @@ class InstanceCodes(nn.Module):
         axes = self.axes
         return (code - self.average) @ axes.T / axes.square().sum(-1)
 
-    def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
+    def draw_code(self, generator: torch.Generator) -> Float[Tensor, " code"]:
         """Random code from the Gaussian fitted to the trained codes."""
         axes = self.axes
         return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes

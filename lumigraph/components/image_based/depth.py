@@ -14,7 +14,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float
 from scipy import sparse
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -22,17 +22,22 @@ from torch.nn.functional import interpolate
 from ... import kernels
 from ...camera import Camera
 from ...camera.lens import OpenCV, Pinhole
+from ...datasets.images.resize import resized
+from ...datasets.mesh import Mesh
 from ...datasets.scene import Frame, Photograph, Scene
 from ...depth_maps import DepthMap
 from ...depth_maps.flat_view import GREY, flat_view
 from ...depth_maps.multi_view import multi_view_depth
 from ...errors import LumigraphError, LumigraphWarning
 from ...files.reading import reading
+from ...geometry import evenly
 from ..fields.level_set import level_set
 from ..sampling.occupancy import visual_hull
 
 Geometry = Literal["stereo", "measured", "hull", "mesh", "plane"]
 HULL_CELLS = 64  # of a visual hull, along each side of the box
+HULL_VIEWS, HULL_SEEN = 40, 0.5  # photographs that are asked, and share of them inside whose borders a cell must be
+HULL_REACH, HULL_BLUR = 4.0, 1.0  # cells that distances from its surface reach, and deviation of their smoothing
 FILL_SIDE = 100  # pixels along the longer side of the grid on which gaps are first filled
 SWEEPS = 40  # of relaxation at the full size
 COLOUR_DEVIATION = 0.06  # of grey, across which depth is less likely to go on
@@ -68,12 +73,15 @@ def complete_depths(
         scene.layer("depth")
         found = [_measured(scene.photograph(int(i), ("depth",)), grid) for i, grid in _numbered(scene, grids)]
     elif geometry in ("mesh", "hull"):
-        surface = proxy_mesh(mesh_file, scene.frame) if geometry == "mesh" else hull_surface(scene)
-        if surface is None:
+        hull = hull_surface(scene) if geometry == "hull" else None
+        if geometry == "hull" and hull is None:
             raise LumigraphError(
                 f"{scene.source} shows no object cut out by alpha, so it has no visual hull; give --geometry stereo"
             )
-        found = [mesh_distance(*surface, grid) for grid in grids]
+        corners, faces = (hull.vertices, hull.faces) if hull else proxy_mesh(mesh_file, scene.frame)
+        found = [
+            mesh_distance(torch.from_numpy(corners).float(), torch.from_numpy(faces).int(), grid) for grid in grids
+        ]
     else:
         found = [torch.full(shape(grid), math.nan) for grid in grids]
     alone = typical_inverse_depth(scene, grids, found)
@@ -151,21 +159,29 @@ def resampled(seen: DepthMap, grid: Camera) -> Float[Tensor, "height width"]:
 
 def _measured(photograph: Photograph, grid: Camera) -> Float[Tensor, "height width"]:
     """A photograph's depth layer, resampled to its depth map's pixels, each by the nearest."""
-    depth = photograph.extra["depth"]
-    return interpolate(depth[None, None], shape(grid), mode="nearest-exact")[0, 0]
+    depth = photograph.extra["depth"].numpy()
+    return torch.from_numpy(resized(depth, shape(grid)[::-1], "plain", ~np.isnan(depth)))
 
 
-def hull_surface(scene: Scene) -> tuple[Float[Tensor, "vertex 3"], Tensor] | None:
-    """Vertices and faces of the visual hull of photographs with alpha (Gortler 1996, sec. 3.2.1); None without one."""
-    solid = visual_hull(scene, HULL_CELLS).numpy()
-    centres = (np.arange(HULL_CELLS) + 0.5) * 2 / HULL_CELLS - 1
+def hull_surface(scene: Scene, cells: int = HULL_CELLS) -> Mesh | None:
+    """Visual hull of photographs with alpha, its stairs smoothed (Gortler 1996, sec. 3.2.1); None without one.
+
+    cells: of a grid over [-1, 1]^3, along each axis
+    """
+    solid = visual_hull(scene, cells).numpy()
+    centres = (np.arange(cells) + 0.5) * 2 / cells - 1
     for axis, (low, high) in enumerate(zip(*scene.frame.bounds, strict=True)):
         solid[(slice(None),) * axis + ((centres < low) | (centres > high),)] = False
-    if not scene.frame.has_alpha or not solid.any():
+    places = torch.from_numpy(2 / cells * (np.argwhere(solid) + 0.5) - 1).float()
+    views = [
+        scene.cameras[int(i)].locate(places)[1].float() for i in evenly(scene.splits["train"].tolist(), HULL_VIEWS)
+    ]
+    solid[solid] = (sum(views) >= HULL_SEEN * len(views)).numpy()  # a place outside the pictures is in no silhouette
+    if not scene.frame.has_alpha or scene.frame.times is not None or not solid.any():
         return None
-    smooth = gaussian_filter(solid.astype(np.float32), 1.0) - 0.5
-    mesh = level_set(smooth, np.full(3, 1 / HULL_CELLS - 1), 2 / HULL_CELLS)
-    return torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces).int()
+    away = (distance_transform_edt(solid) - distance_transform_edt(~solid)).clip(-HULL_REACH, HULL_REACH)
+    values = gaussian_filter(away, HULL_BLUR) - math.sqrt(3) / 2  # by which `visual_hull` is too large
+    return level_set(values, np.full(3, 1 / cells - 1), 2 / cells) if (values > 0).any() else None
 
 
 def proxy_mesh(file: str, frame: Frame) -> tuple[Float[Tensor, "vertex 3"], Tensor]:

@@ -50,7 +50,11 @@ class StepNumbers:
     """A Config's numbers of the steps along a ray, for fields without a grid (Müller 2022, appendix E.1)."""
 
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the diagonal, E.1; fewer are faster
-    cone_angle: Share = 1 / 256  # growth of the step with distance, appendix E.1; higher: fewer samples far away
+
+    @property
+    def cone_angle(self) -> float:
+        """Growth of the step with distance in the open: 1 / 256 for the paper's steps, appendix E.1."""
+        return 4 / self.steps_per_diagonal
 
 
 class Stage(NamedTuple):

@@ -236,7 +236,7 @@ def some(points: Points, generator: torch.Generator) -> Points:
 
 # Numbers of a Config for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
 CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
-CPU_HASH: dict[str, Any] = {"table": CPU_TABLE, "occupancy": CPU_OCCUPANCY, "steps": StepNumbers(384, 1 / 96)}
+CPU_HASH: dict[str, Any] = {"table": CPU_TABLE, "occupancy": CPU_OCCUPANCY, "steps": StepNumbers(384)}
 TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
 TINY_HASH: dict[str, Any] = {"table": TINY_TABLE, "occupancy": TINY_OCCUPANCY, "steps": StepNumbers(128)}
 

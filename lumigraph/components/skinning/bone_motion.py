@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.interpolate import make_smoothing_spline
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import diags_array
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -19,7 +22,7 @@ from ...datasets.scene import Frame, Scene
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
 from ...errors import LumigraphError
 from ...exchange.bones import SUFFIXES, read_motion
-from ...files.ranges import Layers, LearningRate, Share, Width
+from ...files.ranges import LearningRate, Share
 from ...geometry import multiply, to_matrix, to_quaternion
 from ...method import Part
 from ...method.controls import Control, Value, moment
@@ -32,7 +35,15 @@ MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
 KEPT_CLIPS = 8  # files of poses that are kept in memory
 MIN_MOMENTS = 5  # that a smoothing spline goes through
-SMOOTHINGS = 10  # over the budget
+SMOOTHINGS = 10  # over the budget, of given poses at its beginning and then of corrections
+SMOOTHING_SHARE = 0.02  # of the budget's seconds that smoothing may take
+SMOOTHING_WEIGHTS = np.geomspace(1e-3, 1e6, 19)  # of curvature, for moments 1 apart: hardly any, to a straight line
+MIN_POSE_ERROR, MAX_POSE_ERROR = 1.0, 10.0  # degrees; a joint below is exact, above it moves too fast for its moments
+MIN_DISTURBED_SHARE = 0.5  # of the joints with such errors; fewer are sudden motions of an exact body
+TRACE_STEP = 1e-3  # of the weight's logarithm
+
+POSE_WIDTH = 256  # channels of the network's layers
+POSE_DEPTH = 4  # its hidden layers
 
 
 @dataclass(frozen=True)
@@ -42,8 +53,6 @@ class BoneNumbers:
     pose_correction: Literal["no", "table", "network"] = "network"  # corrections of joints: none, of each moment, a MLP
     pose_lr: LearningRate = 5e-5  # learning rate of the corrections; of a table in radians a step
     pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
-    pose_width: Width = 256  # channels of the network's layers
-    pose_depth: Layers = 4  # its hidden layers
     pose_smoothing: bool = False  # smooth given poses over time, as far as cross-validation finds; exact ones stay
 
 
@@ -53,7 +62,7 @@ class BoneMotion(Part):
     Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
     stay. Between two times of the capture joints are interpolated.
     quaternions: given rotations of joints in their parents; with `pose_smoothing` after it
-    seen:     times with photographs, which are smoothed;  smoothings: number of completed smoothings
+    seen:     times with photographs, which are smoothed;  smoothings: number of smoothings completed or left out
     turns:    learnt rotation vectors of each time's joints, radians, one after another, with "table"
     network:  maps angles of all joints to these, with "network"
     """
@@ -88,7 +97,7 @@ class BoneMotion(Part):
         self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
         if n.pose_correction == "network":
-            widths = [self.given_angles.shape[1], *[n.pose_width] * n.pose_depth]
+            widths = [self.given_angles.shape[1], *[POSE_WIDTH] * POSE_DEPTH]
             layers = [x for a, b in zip(widths, widths[1:], strict=False) for x in (nn.Linear(a, b), nn.ReLU())]
             last = nn.Linear(widths[-1], 3 * bones)
             nn.init.uniform_(last.weight, -MIN_OUTPUT, MIN_OUTPUT)
@@ -97,26 +106,28 @@ class BoneMotion(Part):
 
     # Corrections
 
+    @torch.no_grad()
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        if self.numbers.pose_smoothing and data.cameras.time is not None:
-            times = data.cameras.time[data.splits["train"]].unique().to(self.times)
-            rows = (self.times[:, None] - times).abs().argmin(0).unique()
-            self.seen[rows] = len(rows) >= MIN_MOMENTS
-            self.smooth()
-
-    def before_step(self, method: Any, step: int, progress: float) -> None:
-        if self.numbers.pose_smoothing and progress * SMOOTHINGS >= self.smoothings + 1:
-            self.smoothings += 1
-            self.smooth()
+        """Smooth the given poses; later smoothings take as long, and as many follow as their share of time allows."""
+        if not self.numbers.pose_smoothing or data.cameras.time is None:
+            return
+        times = data.cameras.time[data.splits["train"]].unique().to(self.times)
+        rows = (self.times[:, None] - times).abs().argmin(0).unique()
+        if len(rows) < MIN_MOMENTS:
+            return
+        self.seen[rows], since = True, time.perf_counter()
+        self.quaternions[rows] = smoothed_poses(self.quaternions[rows], self.times[rows])
+        count = SMOOTHING_SHARE * seconds / (time.perf_counter() - since)
+        self.smoothings += SMOOTHINGS - int(min(count, SMOOTHINGS))
 
     @torch.no_grad()
-    def smooth(self) -> None:
-        """Smooth the poses of photographs with their current corrections, each joint over time. A network's corrections
-        follow from the given poses, so those are smoothed once."""
-        if self.seen.any() and (self.network is None or not self.smoothings):
-            self.quaternions[self.seen] = smoothed(self.corrected()[self.seen], self.times[self.seen])
-            if self.turns is not None:
-                self.turns.view(len(self.times), -1)[self.seen] = 0
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        """Smooth a table's corrections. Those of a network follow smoothly from the given poses."""
+        if self.numbers.pose_smoothing and progress * SMOOTHINGS >= self.smoothings + 1:
+            self.smoothings += 1
+            if self.turns is not None and self.seen.any() and self.turns.any():
+                turns = self.turns.view(len(self.times), -1)
+                turns[self.seen], _ = on_splines(turns[self.seen], self.times[self.seen])
 
     @property
     def given_angles(self) -> Float[Tensor, "moment angle"]:
@@ -211,7 +222,7 @@ def skeleton_of(frame: Frame) -> Skeleton:
     if frame.skeleton is None:
         raise LumigraphError(
             "The scene has no skeleton, and this method moves a body by one; put bones.json beside the photographs, as "
-            "docs/datasets.md says"
+            "docs/people.md says"
         )
     return frame.skeleton
 
@@ -228,17 +239,51 @@ def clip_of(path: str, frame: Frame) -> BoneMotion:
     return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
 
 
-def smoothed(turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " moment"]) -> Float[Tensor, "moment bone 4"]:
-    """Unit quaternions smoothed by splines over time, one for each component of each joint.
-
-    The smoothing weight minimises generalised cross-validation (Wahba 1990, section 4.3): large for errors that are
-    independent over time, and close to zero for exact poses of a smooth motion.
-    """
+def smoothed_poses(
+    turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " moment"]
+) -> Float[Tensor, "moment bone 4"]:
+    """Unit quaternions of joints, each component on a smoothing spline over time. An exact body keeps its rotations,
+    and so do joints that turn too far from moment to moment to tell errors from motion."""
     flips = torch.where((turns[1:] * turns[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).cumprod(0)
-    even = torch.cat([turns[:1], turns[1:] * flips]).flatten(1).cpu().double().numpy()
-    place = (times / times.diff().median()).cpu().double().numpy()  # the weight's search needs knots about 1 apart
-    fitted = np.stack([make_smoothing_spline(place, column)(place) for column in even.T], 1)
-    return normalize(torch.from_numpy(fitted).to(turns).view_as(turns), dim=-1)
+    even = torch.cat([turns[:1], turns[1:] * flips])
+    fitted, variance = on_splines(even.flatten(1), times)
+    degrees = torch.rad2deg(2 * variance.view(turns.shape[1:]).sum(-1).sqrt())[:, None]
+    disturbed = (degrees > MIN_POSE_ERROR) & (degrees < MAX_POSE_ERROR)
+    if disturbed.float().mean() < MIN_DISTURBED_SHARE:
+        return turns
+    return torch.where(disturbed, normalize(fitted.view_as(turns), dim=-1), turns)
+
+
+def on_splines(
+    values: Float[Tensor, "moment column"], times: Float[Tensor, " moment"], weights: np.ndarray = SMOOTHING_WEIGHTS
+) -> tuple[Float[Tensor, "moment column"], Float[Tensor, " column"]]:
+    """Columns on natural cubic smoothing splines (Reinsch 1967), and the variance of the errors that each has lost.
+
+    Of the weights of squared curvature each column has the one of least generalised cross-validation (Wahba 1990,
+    section 4.3): large for errors that are independent over time, the smallest for exact values of a smooth motion.
+    """
+    rows, y = len(times), values.cpu().double().numpy()
+    h = (times.diff() / times.diff().median()).cpu().double().numpy()
+    second = diags_array([1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]], offsets=[0, 1, 2], shape=(rows - 2, rows))  # type: ignore[arg-type]
+    square = second @ second.T
+    curvature = np.stack([np.pad(square.diagonal(k), (0, k)) for k in range(3)])
+    overlap = np.stack([(h[:-1] + h[1:]) / 3, np.pad(h[1:-1] / 6, (0, 1)), np.zeros(rows - 2)])  # of hats
+
+    def factor(weight: float) -> np.ndarray:
+        return cholesky_banded(overlap + weight * curvature, lower=True)
+
+    def log_determinant(weight: float) -> float:
+        return 2 * float(np.log(factor(weight)[0]).sum())
+
+    least, lost, variance = np.full(y.shape[1], np.inf), np.zeros_like(y), np.zeros(y.shape[1])
+    for weight in weights:
+        errors = weight * (second.T @ cho_solve_banded((factor(weight), True), second @ y))
+        upper, lower = (log_determinant(weight * math.exp(step)) for step in (TRACE_STEP, -TRACE_STEP))
+        freedom = (upper - lower) / (2 * TRACE_STEP)  # trace of what the spline takes from values, I - A
+        found = np.square(errors).sum(0) / freedom
+        better = found / freedom < least
+        least[better], lost[:, better], variance[better] = (found / freedom)[better], errors[:, better], found[better]
+    return torch.from_numpy(y - lost).to(values), torch.from_numpy(variance).to(values)
 
 
 def exponential(omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 4"]:

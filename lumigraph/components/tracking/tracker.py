@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from ...datasets.scene import Scene
-from ...errors import LumigraphError
+from ...errors import LumigraphError, LumigraphWarning
 from ...files.ranges import Share, between
 from ...method import Part
+from .alignment import sensor_deviation
 from .frames import DepthFrame, Moment, order_of
-from .loops import Loops
-from .trajectory import KNOWN, Pose, Trajectory, relative
+from .loops import TOLERANCE, FramePlaces, Loops, motion_between, moved
+from .trajectory import KNOWN, Pose, Trajectory, angle, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
 MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
+FAST = 0.02, 0.026  # metres and radians a frame, above which tracking begins with features
+MAX_MOTION = 0.05, 0.053  # metres and radians a frame, above which a warning is given
+RECENT_FRAMES, JUDGED_FRAMES = 4, 10  # whose motion decides about features, and about the warning
+AGREEMENT_POINTS, AGREEMENT_KEYFRAMES = 2000, 3  # pixels of a frame, and keyframes that they are compared with
+AGREEMENT_DEVIATIONS = 3.0  # of the sensor, within which depths agree
+MIN_AGREEMENT, MIN_ON_KEYFRAME = 0.65, 0.35  # share of common points that must agree; of a keyframe's, which hides some
+MIN_COMMON = 0.2  # share of a frame's points in common with another, below which they are not compared
 ALIGNMENT_POINTS = 3000  # pixels of a frame that are aligned with the map's surface
 ALIGNMENT_ITERATIONS = 12  # Gauss-Newton steps of that
 
@@ -50,9 +61,14 @@ class Tracker(Part):
         super().__init__()
         self.numbers, self.unit, self.side = numbers, unit, side
         self.trajectory = Trajectory(image_count)
-        self.loops = Loops(unit) if numbers.track and numbers.close_loops else None
+        self.loops, self.places = Loops(unit) if numbers.track and numbers.close_loops else None, FramePlaces()
+        if self.loops is not None:
+            self.loops.places = self.places
         self.register_buffer("turn", torch.tensor(0))
         self.register_buffer("is_keyframe", torch.zeros(image_count, dtype=torch.bool))
+        self.overlap = 1.0  # share of the latest frame's points on the depth of a late keyframe
+        self._latest: DepthFrame | None = None
+        self._warned = False
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
@@ -72,7 +88,9 @@ class Tracker(Part):
         return Moment(data, self.frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
 
     def frame(self, data: Scene, index: int) -> DepthFrame:
-        """Load a frame, from memory for a stored keyframe."""
+        """Load a frame, from memory for a stored keyframe and the last known frame."""
+        if self._latest is not None and self._latest.index == index:
+            return self._latest
         if index not in self._held:
             like = next(iter(self._held.values()), None)
             return DepthFrame.of(data, index, self.turn.device, like, self.side)
@@ -111,31 +129,97 @@ class Tracker(Part):
         find: Callable[[DepthFrame, Pose], Pose],
         explained: Callable[[DepthFrame, Pose], float],
     ) -> float | None:
-        """Track the next frame, initialised by constant velocity, then by the last known pose. Returns the share of its
-        pixels explained by the map, or None if tracking is lost: it then keeps the last known pose.
+        """Track the next frame, initialised by constant velocity, the last known pose, then by matched features,
+        which come first where the camera moves fast or was lost. Returns the share of its pixels explained by the map,
+        or None if tracking is lost: it then keeps the last known pose.
 
         find: a frame's pose from a first estimate; explained: its share of explained pixels at a pose
         """
-        trajectory = self.trajectory
+        trajectory, data = self.trajectory, moment.scene
         self.turn += 1
         anchor = max(self.keyframes, default=frame.index)
         if not self.numbers.track or not moment.before:
-            trajectory.know(frame.index, moment.scene.cameras.pose[frame.index].to(self.turn.device), anchor)
+            trajectory.know(frame.index, data.cameras.pose[frame.index].to(self.turn.device), anchor)
             return 1.0
-        known = [i for i in moment.before if trajectory.state[i] == KNOWN][::-1]
-        last = trajectory.poses[known[0]]
-        steady = moment.before[-1:] == known[:1]
-        for start in [trajectory.predicted(known[:2]), last] if steady else [last]:
-            pose = find(frame, start)
+        known = [i for i in moment.before if trajectory.state[i] == KNOWN]
+        last, steady = trajectory.poses[known[-1]], moment.before[-1:] == known[-1:]
+        smooth = [trajectory.predicted(known[:-3:-1]), last] if steady else [last]
+        shift, turn = trajectory.speed(known[-RECENT_FRAMES:])
+        fast = not steady or len(known) < RECENT_FRAMES or shift > FAST[0] * self.unit or turn > FAST[1]
+        limit = len(moment.before) - moment.before.index(known[-1])  # frames since the last known pose
+        by_velocity = (pose for start in smooth if self.plausible(last, pose := find(frame, start), limit))
+        by_features = (
+            pose for start in self.by_features(frame, data, known[-1]) for pose in (find(frame, start), start)
+        )
+        for pose in chain(by_features, by_velocity) if fast else chain(by_velocity, by_features):
             share = explained(frame, pose)
-            if share > self.numbers.lost_share and self.plausible(last, pose):
+            if share > self.numbers.lost_share and self.agrees(frame, pose, data, known[-1]):
                 trajectory.know(frame.index, pose, anchor)
+                self._latest = frame
+                self.places.keep([*self.keyframes, frame.index])
+                self.warn_of_speed([*known, frame.index])
                 return share
         trajectory.lose(frame.index, last)
         return None
 
-    def plausible(self, last: Pose, pose: Pose) -> bool:
-        """True for a motion plausible for a hand-held camera between two frames."""
+    def by_features(self, frame: DepthFrame, data: Scene, last: int) -> Iterator[Pose]:
+        """Poses by features matched with the latest keyframe, the last known frame, and keyframes that look alike."""
+        chance, older = torch.Generator().manual_seed(frame.index), self.keyframes
+
+        def others() -> Iterator[DepthFrame]:
+            yield from (self.frame(data, i) for i in dict.fromkeys([*older[-1:], last]))
+            yield from self.places.alike(frame, [self.load_keyframe(data, i) for i in older[:-1] if i != last])
+
+        for other in others():
+            found = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
+            if found is not None:
+                yield moved(self.trajectory.poses[other.index], found.to(self.trajectory.poses))
+
+    @torch.no_grad()
+    def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:
+        """True if measured points of a frame lie on the depth of the last known frame, and are not in front of that of
+        the keyframe with most points in common: no error of the map can spoil these. Also where they share too little.
+        Stores the largest share of points that lie on a late keyframe's depth."""
+        pixels = frame.sample_pixels(AGREEMENT_POINTS, torch.Generator().manual_seed(frame.index), measured=True)
+        points = frame.rays[pixels].at(frame.depth[pixels]) @ pose[:, :3].T + pose[:, 3]
+
+        def compared(other: DepthFrame) -> tuple[float, float, float]:
+            """Shares of the points that are in the picture, on its depth, and in front of that."""
+            there = self.trajectory.poses[other.index]
+            local = (points - there[:, 3]) @ there[:, :3]
+            places, inside = other.camera.locate(local)
+            away = local.norm(dim=-1)
+            ahead = other.depth.view(other.size[::-1])[places[:, 0], places[:, 1]] - away
+            seen, off = inside & ahead.isfinite(), AGREEMENT_DEVIATIONS * self.unit * sensor_deviation(away / self.unit)
+            shares = (x.float().mean() for x in (seen, seen & (ahead.abs() < off), seen & (ahead >= off)))
+            common, near, front = (float(x) for x in shares)
+            return common, near, front
+
+        if not len(pixels):
+            return True
+        common, near, _ = compared(self.frame(data, last))
+        keyframes = [compared(self.load_keyframe(data, i)) for i in self.keyframes[-AGREEMENT_KEYFRAMES:]]
+        self.overlap = max((x[1] for x in keyframes), default=1.0)
+        most, on, front = max(keyframes, default=(0.0, 0.0, 0.0))
+        steady = common < MIN_COMMON or near > MIN_AGREEMENT * common
+        return steady and (most < MIN_COMMON or (on > MIN_ON_KEYFRAME * most and on > MIN_AGREEMENT * (on + front)))
+
+    def warn_of_speed(self, known: list[int]) -> None:
+        """Warn once, of motion beyond the range of tracking in ten frames."""
+        shift, turn = self.trajectory.speed(known[-JUDGED_FRAMES:])
+        fast = shift > MAX_MOTION[0] * self.unit or turn > MAX_MOTION[1]
+        if self._warned or len(known) < JUDGED_FRAMES or not fast:
+            return
+        self._warned = True
+        warnings.warn(
+            f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame "
+            f"(median of {JUDGED_FRAMES}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
+            f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
+            LumigraphWarning,
+            stacklevel=2,
+        )
+
+    def plausible(self, last: Pose, pose: Pose, frames: int) -> bool:
+        """True for a motion plausible for a hand-held camera within so many frames."""
         turn, shift = relative(last, pose)
-        angle = torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))
-        return float(shift.norm()) < MAX_STEP[0] * self.unit and float(angle) < MAX_STEP[1]
+        return float(shift.norm()) < frames * MAX_STEP[0] * self.unit and float(angle(turn)) < frames * MAX_STEP[1]

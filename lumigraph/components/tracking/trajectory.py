@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import torch
@@ -59,6 +61,13 @@ class Trajectory(Part):
         turn, shift = relative(self.poses[before[1]], last)
         return torch.cat([last[:, :3] @ turn, (last[:, :3] @ shift + last[:, 3])[:, None]], -1)
 
+    def speed(self, images: list[int]) -> tuple[float, float]:
+        """Median motion from each of these frames to the next one: scene units, radians; infinity for no two frames."""
+        if len(images) < 2:
+            return math.inf, math.inf
+        turns, shifts = zip(*(relative(self.poses[a], self.poses[b]) for a, b in pairwise(images)), strict=True)
+        return float(torch.stack(shifts).norm(dim=-1).median()), float(angle(torch.stack(turns)).median())
+
     def correct(self, keyframes: Int[Tensor, " keyframe"], twists: Twist) -> None:
         """Correct keyframes by twists, and the frames anchored to them."""
         self.place(keyframes.tolist(), apply_twists(self.poses[keyframes], twists))
@@ -88,6 +97,11 @@ def relative(first: Pose, second: Float[Tensor, "*frame 3 4"]) -> tuple[Tensor, 
     """Rotation and shift of poses in the frame of the first: first^-1 second."""
     back = first[:, :3].T
     return back @ second[..., :3], (second[..., 3] - first[:, 3]) @ back.T
+
+
+def angle(turn: Float[Tensor, "*pose 3 3"]) -> Float[Tensor, "*pose"]:
+    """Angle of rotations, radians."""
+    return torch.arccos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
 
 
 def apply_twists(poses: Float[Tensor, "pose 3 4"], twists: Twist) -> Float[Tensor, "pose 3 4"]:

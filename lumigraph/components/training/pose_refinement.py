@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from ...camera import Camera
 from ...camera.rays import Rays
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import LearningRate
 from ...geometry import rotated
 from ...method import Part
 from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
@@ -27,6 +26,7 @@ ACCURACY = 0.4  # pixels to which a feature's place is known
 TIED = 12  # matches for each photograph, fewer of which are not asked where cameras stand
 FINE = 0.1  # of the rate, where poses were found before the scene
 FALL = 0.02  # of the rate, that is left of it at the end of the budget
+POSE_LEARNING_RATE = 5e-4  # of fields: radians that a step moves a picture at most
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,14 @@ class PoseNumbers:
     """A Config's numbers of pose refinement."""
 
     refine_cameras: bool = False  # learn a correction of each photograph's pose, coarse to fine (Lin 2021, BARF)
-    pose_learning_rate: LearningRate = 5e-4  # pose rate with refine_cameras, in radians a step moves a picture
     match_photographs: bool = True  # with refine_cameras, begin with poses from matched features; slower to begin
 
 
-def poses_for(frame: Frame, numbers: PoseNumbers) -> PoseRefinement | None:
+def poses_for(frame: Frame, numbers: PoseNumbers, rate: float = POSE_LEARNING_RATE) -> PoseRefinement | None:
     """A `PoseRefinement`, if enabled by the numbers."""
     if not numbers.refine_cameras:
         return None
-    return PoseRefinement(frame.image_count, numbers.pose_learning_rate, numbers.match_photographs)
+    return PoseRefinement(frame.image_count, rate, numbers.match_photographs)
 
 
 class PoseRefinement(Part):
@@ -115,7 +114,7 @@ class PoseRefinement(Part):
         omega, shift = self.moves[rays.image_index].split(3, -1)
         return replace(rays, origins=rays.origins + shift, directions=rotated(rays.directions, omega))
 
-    def moved(self, rays: Rays) -> Rays:
+    def refine_rays(self, rays: Rays) -> Rays:
         return self(rays)
 
     @torch.no_grad()

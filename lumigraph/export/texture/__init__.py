@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 
+from ...components.fields.charts import unwrap
 from ...datasets.mesh import Mesh, MeshTexture
 from ...errors import LumigraphError
 from ...system.memory import ask_for
 from ...system.progress import counting
-from ..surface import Faces, Triangles, Vertices, vertex_normals
-from .atlas import texels_of, unwrap
+from ..surface import Faces, Triangles, Vertices, unit, vertex_normals
+from .atlas import texels_of
 from .colours import PosedPicture as PosedPicture
 from .colours import blended, collected, gains, spread_to_unseen
 from .colours import photographed as photographed
@@ -46,8 +47,7 @@ def textured(
         original, charts, uv = unwrap(vertices, faces, size)
         normals, vertices = vertex_normals(vertices, faces)[original], vertices[original]
         texels = texels_of(vertices, charts, uv, size)
-    points, facing = texels.interpolated(vertices, charts), texels.interpolated(normals, charts)
-    facing /= np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-30)
+    points, facing = texels.interpolated(vertices, charts), unit(texels.interpolated(normals, charts))
     rgb, known = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), bool)
     for source in sources:
         left = np.flatnonzero(~known)

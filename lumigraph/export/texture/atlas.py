@@ -11,27 +11,7 @@ from scipy import ndimage
 from ..surface import Faces, Vertices
 from . import loops
 
-PADDING_TEXELS = 4  # between charts
 BORDER_TEXELS = 1.5  # around charts, whose points are extrapolated, for bilinear interpolation at a chart's edge
-
-
-def unwrap(
-    vertices: Vertices, faces: Faces, size: int
-) -> tuple[Int[np.ndarray, " split"], Faces, Float[np.ndarray, "split 2"]]:
-    """Charts of a mesh, packed into a square of so many texels a side (xatlas).
-
-    Returns the vertex that each vertex of a chart is a copy of, the faces between these copies, and their places in the
-    square: (0, 0) is its upper left corner, (1, 1) its lower right one.
-    """
-    import xatlas
-
-    atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
-    packing.resolution, packing.padding, packing.bilinear = size, PADDING_TEXELS, True
-    atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
-    atlas.generate(pack_options=packing)
-    original, charts, uv = atlas.get_mesh(0)
-    longest = max(atlas.width, atlas.height)
-    return original.astype(np.int64), charts.astype(np.int64), uv * (np.array([atlas.width, atlas.height]) / longest)
 
 
 @dataclass(frozen=True)

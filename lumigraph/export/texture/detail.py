@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from ...system.threads import processors
-from ..surface import Faces, Triangles, Vertices, tangents, vertex_normals
+from ..surface import Faces, Triangles, Vertices, tangents, unit, vertex_normals
 from .atlas import Texels
 
 NEIGHBOURS = 4  # vertices of the detailed mesh that the normal of a texel is interpolated between
@@ -43,7 +43,3 @@ def normal_map(
         local = np.stack([(seen * axis).sum(-1) for axis in (along, across, up)], -1)
         found[first : first + len(part)] = np.rint(255 * (0.5 + 0.5 * local))
     return found
-
-
-def unit(vectors: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "row 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

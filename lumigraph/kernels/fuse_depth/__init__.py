@@ -30,17 +30,19 @@ def fuse_depth(
     truncation: float,
     edge: float,
     max_weight: float = math.inf,
+    growth: float = 0.0,
     in_place: bool = False,
 ) -> Float[Tensor, "block 512 5"]:
     """Voxels (distance D, weight W, colour) after integrating a depth map (Curless and Levoy 1996, eq. 3 and 4).
 
-        d = min((depth - |p - o|) / truncation, 1)     D <- (W D + w d) / (W + w)     W <- min(W + w, max_weight)
+        d = min((depth - |p - o|) / truncation, r)     D <- (W D + w d) / (W + w)     W <- min(W + w, max_weight)
 
-    for voxels at p = voxel (8 block + (i, j, k)) inside the picture, where d >= -1 and w > 0; others stay. Depth,
-    colour and weight w = trust are interpolated between the four pixels around a voxel's projection. Where their depths
-    differ by more than `edge` times the least, at a depth edge, the nearest pixel is taken. Where one of the four
-    depths is unknown (not finite or not positive), so is the voxel's. The colour is averaged likewise, but only over
-    voxels within the band, |d| < 1; red is UNCOLOURED before the first.
+    for voxels at p = voxel (8 block + (i, j, k)) inside the picture, where d >= -r and w > 0; others stay. The band
+    widens with depth, r = 1 + growth depth / truncation. Depth, colour and weight w = trust are interpolated between
+    the four pixels around a voxel's projection. Where their depths differ by more than `edge` times the least, at a
+    depth edge, and where one of them is unknown (not finite or not positive), the nearest known one of the four is
+    taken. The colour is averaged likewise, but only over voxels within the band, |d| < r; red is UNCOLOURED before the
+    first.
 
     voxels:   [block, (i, j, k) with k fastest, channel]
     depth:    along rays; pose: camera-to-world, OpenCV axes; lens: of a pinhole, (fx, fy, cx, cy) in pixels
@@ -48,11 +50,12 @@ def fuse_depth(
     Not differentiable.
     """
     require(voxel > 0 and 0 < truncation < math.inf, f"voxel {voxel} and truncation {truncation} cannot be")
+    require(0 <= growth < math.inf, f"a truncation cannot grow by {growth} of the depth")
     require(not in_place or voxels.is_contiguous(), "voxels to be changed in place must be contiguous")
     with torch.no_grad():
         out = voxels if in_place else voxels.clone(memory_format=torch.contiguous_format)
         if depth.numel():
-            given = depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight
+            given = depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight, growth
             implementation("fuse_depth", voxels)(out, blocks, *given)
     return out
 
@@ -96,7 +99,7 @@ def _inputs(height, width, side, most, generator):
     voxels[:, ::5, 2:] = UNCOLOURED  # seen as free space alone
     rgb, trust = torch.rand(height, width, 3, generator=generator), torch.rand(height, width, generator=generator)
     trust[torch.rand(height, width, generator=generator) < 0.1] = 0
-    inputs = voxels, blocks, depth, rgb, trust, pose, lens, side / SIDE, truncation, 0.15, most
+    inputs = voxels, blocks, depth, rgb, trust, pose, lens, side / SIDE, truncation, 0.15, most, 0.1 * truncation
     return _steady(*inputs)
 
 

@@ -45,10 +45,18 @@ def _four(values, a, b, c, d, wa, wb, wc, wd):
     return wa * values[a] + wb * values[b] + wc * values[c] + wd * values[d]
 
 
+@njit(inline="always", error_model="numpy")
+def _if_known(depth, weight):
+    return weight if depth > ZERO and depth < INFINITE else -ONE
+
+
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
-def _fuse(voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, voxel, truncation, edge, max_weight):
+def _fuse(
+    voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, voxel, truncation, edge, max_weight, growth
+):
     """Integrate into the chosen blocks. Arrays are flat; indices are unsigned, which saves tests for negative ones."""
     over, wide, high = ONE / truncation, np.float32(width), np.float32(height)
+    widening = growth * over
     last_x, last_y = wide - ONE, high - ONE
     step_x, step_y, step_z = voxel * pose[2, 0], voxel * pose[2, 1], voxel * pose[2, 2]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -78,28 +86,32 @@ def _fuse(voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, 
                 i, j = np.uint32(below * width + left), np.uint32(below * width + right)
                 da, db, dc, dd = depth[a], depth[b], depth[i], depth[j]
                 nearest, farthest = min(min(da, db), min(dc, dd)), max(max(da, db), max(dc, dd))
-                if not (nearest > ZERO and farthest < INFINITE):
-                    continue
                 pz = pz0 + t * voxel
                 away = np.sqrt(across + pz * pz)
-                if (farthest - away) * over < -ONE:
+                if (farthest - away) * over < -ONE - widening * farthest:
                     continue
                 u, v = u - np.float32(left), v - np.float32(top)
                 wa, wb, wc, wd = (ONE - v) * (ONE - u), (ONE - v) * u, v * (ONE - u), v * u
-                if farthest - nearest > edge * nearest:
-                    wa, wb, wc, wd = ONE, ZERO, ZERO, ZERO
-                    a = np.uint32(np.int32(y) * width + np.int32(x))
+                if not (nearest > ZERO and farthest - nearest <= edge * nearest):
+                    wa, wb = _if_known(da, wa), _if_known(db, wb)
+                    wc, wd = _if_known(dc, wc), _if_known(dd, wd)
+                    most = max(max(wa, wb), max(wc, wd))
+                    if most < ZERO:
+                        continue
+                    a = a if wa == most else b if wb == most else i if wc == most else j
                     b, i, j = a, a, a
-                d = (_four(depth, a, b, i, j, wa, wb, wc, wd) - away) * over
+                    wa, wb, wc, wd = ONE, ZERO, ZERO, ZERO
+                surface = _four(depth, a, b, i, j, wa, wb, wc, wd)
+                d, reach = (surface - away) * over, ONE + widening * surface
                 w = _four(trust, a, b, i, j, wa, wb, wc, wd)
-                if d < -ONE or not w > ZERO:
+                if d < -reach or not w > ZERO:
                     continue
                 place = np.uint64(CHANNELS * (VOXELS * number + SIDE * row + k))
                 weight = voxels[place + ONE_ON]
                 share = w / (weight + w)
-                voxels[place] += share * (min(d, ONE) - voxels[place])
+                voxels[place] += share * (min(d, reach) - voxels[place])
                 voxels[place + ONE_ON] = min(weight + w, max_weight)
-                if d < ONE:
+                if d < reach:
                     fresh = voxels[place + np.uint64(2)] == NONE
                     for channel in range(3):
                         at = np.uint32(channel)
@@ -111,13 +123,13 @@ def _fuse(voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, 
                         voxels[place + np.uint64(2 + channel)] = colour if fresh else own + share * (colour - own)
 
 
-def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
+def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight, growth):
     given = blocks, torch.where(depth > 0, depth, 0), rgb, trust, pose, lens  # what is not a number is not positive
     blocks, depth, rgb, trust, pose, lens = (x.detach().contiguous().numpy() for x in given)
     voxel, truncation = np.float32(voxel), np.float32(truncation)
-    farthest = np.where(depth < INFINITE, depth, ZERO).max() + truncation
+    farthest = np.where(depth < INFINITE, depth, ZERO).max() * np.float32(1 + growth) + truncation
     chosen = np.empty(len(blocks), np.int64)
     count = _visible(blocks, *depth.shape, pose, lens, voxel, farthest, chosen)
     pixels = (x.reshape(-1) for x in (depth, rgb, trust))
-    numbers = voxel, truncation, np.float32(edge), np.float32(max_weight)
+    numbers = voxel, truncation, np.float32(edge), np.float32(max_weight), np.float32(growth)
     _fuse(voxels.view(-1).numpy(), blocks, chosen[:count], *pixels, *depth.shape, pose, lens, *numbers)

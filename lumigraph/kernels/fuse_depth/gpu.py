@@ -21,6 +21,11 @@ def _pick(values, a, b, c, d, wa, wb, wc, wd, here, stride: tl.constexpr, channe
 
 
 @triton.jit
+def _if_known(depth, weight):
+    return tl.where((depth > 0) & (depth < float("inf")), weight, -1.0)
+
+
+@triton.jit
 def _rotated(pose, x, y, z, axis: tl.constexpr):
     """One coordinate in the camera's frame."""
     return tl.load(pose + axis) * x + tl.load(pose + 4 + axis) * y + tl.load(pose + 8 + axis) * z
@@ -28,7 +33,7 @@ def _rotated(pose, x, y, z, axis: tl.constexpr):
 
 @triton.jit(do_not_specialize=["height", "width"])
 def _fuse(
-    voxels, blocks, depth, rgb, trust, pose, lens, height, width, voxel, truncation, edge, max_weight
+    voxels, blocks, depth, rgb, trust, pose, lens, height, width, voxel, truncation, edge, max_weight, growth
 ):  # fmt: skip
     number, i = tl.program_id(0).to(tl.int64), tl.arange(0, N)
     px = voxel * (tl.load(blocks + 3 * number) * S + i // (S * S)).to(tl.float32) - tl.load(pose + 3)
@@ -48,29 +53,32 @@ def _fuse(
     a, b, c, d = top * width + left, top * width + right, below * width + left, below * width + right
     da, db = tl.load(depth + a, mask=here, other=0.0), tl.load(depth + b, mask=here, other=0.0)
     dc, dd = tl.load(depth + c, mask=here, other=0.0), tl.load(depth + d, mask=here, other=0.0)
-    here = here & (da > 0) & (db > 0) & (dc > 0) & (dd > 0)
     nearest = tl.minimum(tl.minimum(da, db), tl.minimum(dc, dd))
     farthest = tl.maximum(tl.maximum(da, db), tl.maximum(dc, dd))
-    here = here & (farthest < float("inf"))
     u, v = u - left.to(tl.float32), v - top.to(tl.float32)
-    smooth = farthest - nearest <= edge * nearest
-    wa, wb = tl.where(smooth, (1 - v) * (1 - u), 1.0), tl.where(smooth, (1 - v) * u, 0.0)
-    wc, wd = tl.where(smooth, v * (1 - u), 0.0), tl.where(smooth, v * u, 0.0)
-    a = tl.where(smooth, a, y.to(tl.int32) * width + x.to(tl.int32))
-    # A product of 0 and a depth that is not finite would be no number.
-    finite = here & smooth
+    smooth = (da > 0) & (db > 0) & (dc > 0) & (dd > 0) & (farthest - nearest <= edge * nearest)
+    wa, wb, wc, wd = (1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u
+    ka, kb, kc, kd = _if_known(da, wa), _if_known(db, wb), _if_known(dc, wc), _if_known(dd, wd)
+    most = tl.maximum(tl.maximum(ka, kb), tl.maximum(kc, kd))
+    here = here & (most >= 0)
+    chosen = tl.where(ka == most, a, tl.where(kb == most, b, tl.where(kc == most, c, d)))
+    a = tl.where(smooth, a, chosen)
+    wa, wb = tl.where(smooth, wa, 1.0), tl.where(smooth, wb, 0.0)
+    wc, wd = tl.where(smooth, wc, 0.0), tl.where(smooth, wd, 0.0)
     one = tl.load(depth + a, mask=here, other=1.0)
-    blended = wa * one + wb * tl.where(finite, db, 0.0) + wc * tl.where(finite, dc, 0.0)
-    surface = blended + wd * tl.where(finite, dd, 0.0)
+    # A product of 0 and a depth that is not finite would be no number.
+    blended = wa * one + wb * tl.where(smooth, db, 0.0) + wc * tl.where(smooth, dc, 0.0)
+    surface = blended + wd * tl.where(smooth, dd, 0.0)
+    reach = 1 + growth / truncation * surface
     distance = (surface - tl.sqrt(px * px + py * py + pz * pz)) / truncation
     w = _pick(trust, a, b, c, d, wa, wb, wc, wd, here, 1, 0)
-    here = here & (distance >= -1) & (w > 0)
+    here = here & (distance >= -reach) & (w > 0)
     place = voxels + (number * N + i) * 5
     own, weight = tl.load(place, mask=here, other=0.0), tl.load(place + 1, mask=here, other=0.0)
     share = w / tl.where(here, weight + w, 1.0)
-    tl.store(place, own + share * (tl.minimum(distance, 1.0) - own), mask=here)
+    tl.store(place, own + share * (tl.minimum(distance, reach) - own), mask=here)
     tl.store(place + 1, tl.minimum(weight + w, max_weight), mask=here)
-    here = here & (distance < 1)
+    here = here & (distance < reach)
     fresh = tl.load(place + 2, mask=here, other=0.0) == NONE
     for channel in tl.static_range(3):
         colour = _pick(rgb, a, b, c, d, wa, wb, wc, wd, here, 3, channel)
@@ -78,7 +86,7 @@ def _fuse(
         tl.store(place + 2 + channel, tl.where(fresh, colour, before + share * (colour - before)), mask=here)
 
 
-def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
+def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight, growth):
     given = (x.contiguous() for x in (blocks, depth, rgb, trust, pose, lens))
-    numbers = *depth.shape, float(voxel), float(truncation), float(edge), float(max_weight)
+    numbers = *depth.shape, float(voxel), float(truncation), float(edge), float(max_weight), float(growth)
     launch(_fuse, (len(blocks),), voxels, *given, *numbers, enable_fp_fusion=False)

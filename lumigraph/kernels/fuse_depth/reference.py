@@ -25,33 +25,35 @@ def sample_maps(points, depth, rgb, trust, pose, lens, edge):
     right, below = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
     u, v = u - left, v - top
     corners = torch.stack([depth[top, left], depth[top, right], depth[below, left], depth[below, right]])
-    known = inside & (corners.isfinite() & (corners > 0)).all(0)
-    smooth = corners.amax(0) - corners.amin(0) <= edge * corners.amin(0)
+    known = corners.isfinite() & (corners > 0)
+    smooth = known.all(0) & (corners.amax(0) - corners.amin(0) <= edge * corners.amin(0))
     weights = torch.stack([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u])
+
+    nearest = torch.where(known, weights, -1).argmax(0)[None]
 
     def blend(values):
         corners = torch.stack([values[top, left], values[top, right], values[below, left], values[below, right]])
         share = weights.view(*weights.shape, *(1,) * (values.ndim - 2))
-        nearest = values[y.long(), x.long()]
+        one = corners.take_along_dim(nearest.view(1, -1, *(1,) * (values.ndim - 2)), 0)[0]
         choice = smooth.view(-1, *(1,) * (values.ndim - 2))
-        return torch.where(choice, (share * corners).sum(0), nearest)
+        return torch.where(choice, (share * corners).sum(0), one)
 
-    return blend(depth), blend(rgb), blend(trust), known
+    return blend(depth), blend(rgb), blend(trust), inside & known.any(0)
 
 
-def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
+def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight, growth):
     for number, block in enumerate(blocks):
         points = voxel * (SIDE * block.to(voxels) + offsets(voxels))
         surface, colour, w, known = sample_maps(points, depth, rgb, trust, pose, lens, edge)
-        d = (surface - (points - pose[:, 3]).norm(dim=-1)) / truncation
-        changed = known & (d >= -1) & (w > 0)
+        d, reach = (surface - (points - pose[:, 3]).norm(dim=-1)) / truncation, 1 + growth / truncation * surface
+        changed = known & (d >= -reach) & (w > 0)
         distance, weight, own = voxels[number, :, 0], voxels[number, :, 1], voxels[number, :, 2:]
         share = w / (weight + w).clamp_min(1e-30)
-        within = (changed & (d < 1))[:, None]
+        within = (changed & (d < reach))[:, None]
         mixed = torch.where((own[:, :1] == UNCOLOURED), colour, own + share[:, None] * (colour - own))
         voxels[number] = torch.cat(
             [
-                torch.where(changed, distance + share * (d.clamp(max=1) - distance), distance)[:, None],
+                torch.where(changed, distance + share * (d.minimum(reach) - distance), distance)[:, None],
                 torch.where(changed, (weight + w).clamp(max=max_weight), weight)[:, None],
                 torch.where(within, mixed, own),
             ],

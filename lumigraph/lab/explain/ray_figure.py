@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import math
 from html import escape
 
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...color.tags import srgb_bytes
 from ...figures import to_image
 from ...figures.charts import Axis, numbers, svg
 from .ray import RayPass, Sight, triple
@@ -238,6 +238,4 @@ def hex_of(rgb: Float[Tensor, " 3"]) -> str:
 
 
 def png(picture: Float[Tensor, "height width 3"]) -> str:
-    file = io.BytesIO()
-    to_image(picture).save(file, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(srgb_bytes(to_image(picture), optimize=True)).decode()}"

@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import Annotated, Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -256,14 +256,13 @@ class PlaneMotion(Addition):
         weight = torch.exp(-2 * (away / away[:, -1:].clamp_min(MIN_DISTANCE)).square()).float()
         self.carriers[rows], self.shares[rows] = near, weight / weight.sum(1, keepdim=True)
 
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        """Remove Gaussians. A removed neighbour is replaced by the Gaussian itself, whose loss is zero."""
-        kept = torch.arange(len(self.moves), device=self.moves.device)[keep]
-        own = torch.arange(len(kept), device=kept.device)
-        place = torch.full_like(self.moves, -1, dtype=torch.long).index_copy(0, kept, own)
-        left = place[self.neighbours[kept]]
-        self.moves, self.neighbours = self.moves[kept], torch.where(left < 0, own[:, None], left)
-        self.carriers, self.shares = self.carriers[kept], self.shares[kept]
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
+        """Follow the cloud. A removed neighbour is replaced by the Gaussian itself, whose loss is zero."""
+        own = torch.arange(len(source), device=source.device)
+        place = torch.full_like(self.moves, -1, dtype=torch.long).scatter_reduce(0, source, own, "amax")
+        left = place[self.neighbours[source]]
+        self.moves, self.neighbours = self.moves[source], torch.where(left < 0, own[:, None], left)
+        self.carriers, self.shares = self.carriers[source], self.shares[source]
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
         self.active.fill_(progress >= self.numbers.still_until)
@@ -304,7 +303,7 @@ class PlaneMotion(Addition):
         return (change.square().sum(-1) / near).mean()
 
     def finish(self, step: Step) -> None:
-        if step.due or len(self.moves) != len(step.learnt):
+        if step.due:
             apart = bool(self.active) and step.progress >= TOLD_APART
             self.follow_cloud(step.learnt.means.detach(), apart)
 

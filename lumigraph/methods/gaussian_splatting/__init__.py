@@ -30,6 +30,8 @@ CPU_GROUPS = InstanceNumbers(
     identity_code=8, identity_lr=0.05, classifier_lr=0.02, identity_interval=2, identity_start=0.4
 )
 
+POSE_LEARNING_RATE = 5e-3  # radians that a step moves a picture at most
+
 
 @dataclass(frozen=True)
 class Config:
@@ -40,7 +42,7 @@ class Config:
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
     mcmc: McmcNumbers = McmcNumbers()
     filters: MipNumbers = MipNumbers()
-    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    poses: PoseNumbers = PoseNumbers()
     measured: DepthNumbers = DepthNumbers()
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()
@@ -73,7 +75,7 @@ class GaussianSplatting(CloudMethod):
         self.tidying = Tidying(c.tidying)
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
         self.identities = Identities(c.groups, count) if c.groups.objects == "yes" else None
-        self.poses = poses_for(frame, c.poses)
+        self.poses = poses_for(frame, c.poses, POSE_LEARNING_RATE)
 
     @property
     def least_pixels(self) -> int:

@@ -9,18 +9,20 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, log_softmax
 
 from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.cloud import Cloud
-from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
-from ...datasets.scene import Scene
+from ...components.instances import ALONE, LABELS, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...components.training.row_optimizers import exchange
+from ...datasets.scene import Photograph, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import LearningRate, Share, Steps, between
 from ...gaussians import Gaussians, joined
+from ...gaussians.splatting import Splatted, splat, view_of
 from ...method.controls import Configured, Control
 
 CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
@@ -49,7 +51,7 @@ class Identities(Addition):
     """Identity codes and a linear classifier. They change neither positions nor colours.
 
     codes:  of each Gaussian
-    places: positions of the Gaussians at the last `follow`, to transfer codes after densification
+    places: positions of the Gaussians when codes were last learnt
     seen:   labels in the photographs
     """
 
@@ -66,8 +68,10 @@ class Identities(Addition):
         self.register_buffer("places", torch.zeros(count, 3))
         self.register_buffer("seen", torch.zeros(n.instances, dtype=torch.bool))
         self.optimizer: torch.optim.Adam | None = None
+        self.data: Scene | None = None  # of the last step
 
     def layers(self, data: Scene) -> tuple[str, ...]:
+        self.data = data
         return layers_of(data)
 
     # Following the cloud
@@ -80,26 +84,13 @@ class Identities(Addition):
         drawn = FIRST_DEVIATION * torch.randn(len(cloud), self.numbers.identity_code, generator=chance)
         self._set(drawn.to(self.places.device), cloud.means.detach().clone())
 
-    def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
-        """Transfer codes to a cloned, split or pruned cloud: from the nearest old Gaussian."""
-        if len(means) == len(self.places) and torch.equal(means.detach(), self.places):
-            return
-        if len(means) != len(self.places):
-            nearest = cKDTree(self.places.cpu().numpy()).query(means.detach().cpu().numpy(), workers=-1)[1]
-            self._set(self.codes.data[torch.from_numpy(nearest)], means.detach().clone())
-        else:
-            self.places = means.detach().clone()
-
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        self._set(self.codes.data[keep], self.places[keep])
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
+        self._set(self.codes.data[source], self.places[source])
 
     def _set(self, codes: Tensor, places: Tensor) -> None:
         """Replace the codes, with fresh optimizer moments, for a cloud changes every hundred steps."""
-        old, self.places = self.codes, places
-        self.codes = nn.Parameter(codes.clone())
-        if self.optimizer is not None:
-            self.optimizer.state.pop(old, None)
-            self.optimizer.param_groups[0]["params"] = [self.codes]
+        self.places = places
+        exchange(self, "codes", codes, self.optimizer)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers
@@ -113,24 +104,45 @@ class Identities(Addition):
 
     # Learning
 
+    def before_raster(self, step: Step) -> None:
+        means = step.learnt.means.detach()
+        if len(means) != len(self.places):  # in a run that was saved when codes followed the cloud only while learnt
+            nearest = cKDTree(self.places.cpu().numpy()).query(means.cpu().numpy(), workers=-1)[1]
+            self.follow(torch.from_numpy(nearest).to(means.device))
+
     def regularize(self, step: Step) -> None:
         """Cross entropy of rendered identities, and the neighbours' agreement (eqs. 3 and 4)."""
         n = self.numbers
         if step.progress < n.identity_start or step.drawn % n.identity_interval:
             return
-        self.follow(step.learnt.means)
-        labels, known = labels_of(step.photograph.extra, step.photograph.alpha, n.instances)
+        self.places = step.learnt.means.detach().clone()
+        photograph, picture = step.photograph, step.picture
+        labels, known = labels_of(photograph.extra, photograph.alpha, n.instances)
+        if not known.any() and (other := self.labelled(step)) is not None:
+            with torch.no_grad():
+                picture = splat(step.whole, view_of(step.views.refined(other.camera), step.views.near_plane), bands=1)
+            labels, known = labels_of(other.extra, other.alpha, n.instances)
         self.seen[labels[labels >= 0].unique()] = True
-        logits = self.classifier(self.rendered(step))
+        logits = self.classifier(self.rendered(picture))
         target = torch.where(labels >= 0, labels, n.instances)
         if known.any():
             step.terms["identity"] = IDENTITY_WEIGHT * cross_entropy(logits[known], target[known])
         if len(self.codes) > NEIGHBOURS:
             step.terms["neighbours"] = NEIGHBOUR_WEIGHT * self.disagreement(step.chance)
 
-    def rendered(self, step: Step) -> Float[Tensor, "height width code"]:
+    def labelled(self, step: Step) -> Photograph | None:
+        """A random labelled photograph, for a step on one that has no labels; None without any."""
+        if self.data is None or LABELS not in self.data.layers:
+            return None
+        planes = self.data.layers[LABELS].planes
+        some = [i for i in self.data.splits["train"].tolist() if planes[i] is not None]
+        if not some:
+            return None
+        found = self.data.photograph(some[int(torch.randint(len(some), (), generator=step.chance))], (LABELS,))
+        return found.reduced(max(1, found.rgb.shape[0] // step.rgb.shape[0])).to(step.rgb.device)
+
+    def rendered(self, picture: Splatted) -> Float[Tensor, "height width code"]:
         """Codes, composited as colours are; gradients reach the codes alone."""
-        picture = step.picture
         footprints = picture.centres.detach(), picture.conics.detach(), picture.opacities.detach()
         fixed = replace(picture, centres=footprints[0], conics=footprints[1], opacities=footprints[2])
         found = []

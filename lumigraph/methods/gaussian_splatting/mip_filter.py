@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera import Camera
@@ -44,11 +44,11 @@ class MipFilter(Addition):
         self.interval = sampling_interval(cloud.means, views.cameras, views.near_plane)
 
     def finish(self, step: Step) -> None:
-        if step.due or len(step.learnt) != len(self.interval):
+        if step.due:
             self.begin_cloud(step.learnt, step.views, step.chance)
 
-    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        self.interval = self.interval[keep]
+    def follow(self, source: Int[Tensor, " gaussian"]) -> None:
+        self.interval = self.interval[source]
 
     def filtered(self, cloud: Gaussians) -> Gaussians:
         return convolved(cloud, self.interval)

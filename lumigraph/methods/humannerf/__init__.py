@@ -73,7 +73,7 @@ class HumanNeRF(Articulated, FieldMethod):
     def smallest(cls) -> Any:
         """A tiny table under tiny motions within some twenty quick steps."""
         return changed(changed(Config(), **TINY_BACKBONE), samples_per_step=1024, weight_cells=8, weight_code=4,
-            weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3, pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2,
+            weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3, pose_from=0.0, nonrigid_depth=2,
             nonrigid_width=8, nonrigid_skip=1, nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5,
             nonrigid_lr=1e-3)  # fmt: skip
 

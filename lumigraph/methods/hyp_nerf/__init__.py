@@ -26,7 +26,7 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at, turning
 from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
@@ -40,6 +40,9 @@ Tally = Annotated[int, between(0, 100_000)]
 
 DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in tuning
 
+HYPER_LAYERS = 2  # hidden layers of the hypernetwork for each tensor
+DENOISER_WIDTH = 32  # channels of the denoiser, section 3.3
+
 
 @dataclass(frozen=True)
 class Config:
@@ -50,7 +53,6 @@ class Config:
     colour_code: Width = 512  # numbers of the code of the colour network, section 3.2; more hold more colours
     code_deviation: Positive = 0.01  # standard deviation of codes at first; larger ones start farther apart
     hyper_width: Width = 512  # channels of the hypernetwork's hidden layers; wider costs memory and time
-    hyper_layers: Layers = 2  # hidden layers of the hypernetwork for each tensor; more cost time
     members: Count = 4096  # members of a collection at most; each has a code, so more cost memory
     hidden_width: Width = 64  # channels of an object's density and colour networks; wider costs time
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512  # samples across the diagonal; fewer are faster
@@ -64,7 +66,6 @@ class Config:
     code_weight: NonNegative = 0.0  # weight of the codes' squares in the loss; higher keeps codes near zero
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
-    denoiser_width: Width = 32  # channels of the denoiser, section 3.3; wider costs time
     denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
     # Fitting one scene.
     code_steps: Tally = 200  # steps that fit the code of a new scene, section 3.3; more take longer
@@ -142,8 +143,8 @@ class HypNeRF(RayMethod):
         self.shape = HashShape.of(c.table, c.hidden_width)
         with seeded(c.seed):
             sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
-            self.hyper = HyperNetwork(sizes, c.hyper_width, c.hyper_layers, self.shape.tensors)
-            self.denoiser = PictureDenoiser(c.denoiser_width)
+            self.hyper = HyperNetwork(sizes, c.hyper_width, HYPER_LAYERS, self.shape.tensors)
+            self.denoiser = PictureDenoiser(DENOISER_WIDTH)
         self.codes = InstanceCodes(c.members, c.shape_code + c.colour_code)
         self.found = Kept(torch.empty(0, c.shape_code + c.colour_code))  # the code of a scene that was given, or drawn
         self.tuned = untuned(self.shape)
@@ -166,12 +167,10 @@ class HypNeRF(RayMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        table = HashNumbers(
-            levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
-        )
-        return Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1,
+        table = HashNumbers(levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, sh_bands=1)
+        return Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16,
             hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64,
-            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3, denoiser_width=4,
+            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3,
             denoiser_start=0.0, denoise_views=2, denoise_steps=4, code_steps=8, tune_steps=4)  # fmt: skip
 
     @classmethod
@@ -251,7 +250,7 @@ class HypNeRF(RayMethod):
         terms = {"colour": residual.square().mean()}
         if self.config.empty_points and self.config.empty_weight:
             points = 2 * torch.rand(self.config.empty_points, 3, generator=generator).to(self.device) - 1
-            density = instance.density(points[~held(cells, points)])
+            density = instance.density(points[~in_cells(cells, points)])
             terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY_LENGTH * density).sum() / len(points)
         return terms
 
@@ -345,24 +344,18 @@ class HypNeRF(RayMethod):
         """Bytes of the photographs' sampled pixels, as rays."""
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The field fitted to an object's photographs: first its code, then its tensors (section 3.3); or another
-        trained one."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, HypNeRF)
-        told._shown = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("instance", None)
-            told._find(scene)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Fit the field to an object's photographs: first its code, then its tensors (section 3.3)."""
+        self._shown = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("instance", None)
+            self._find(scene)
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A random object: a code from the Gaussian fitted to the trained codes."""
-        told = super().given()
-        assert isinstance(told, HypNeRF)
-        told.found, told._shown = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None]), None
+        told: Any = self.given()
+        told.found, told._shown = Kept(self.codes.draw_code(torch.Generator().manual_seed(seed))[None]), None
         told.tuned = untuned(self.shape)
         told.settings.pop("instance", None)
         return told
@@ -468,7 +461,7 @@ def untuned(shape: HashShape) -> TensorChanges:
     return TensorChanges(torch.empty(0, *sizes) for sizes in shape.tensors)
 
 
-def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+def in_cells(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
     """Mask of the points of [-1, 1]^3 in possibly occupied cells."""
     x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
     return cells.occupied[0, x, y, z]

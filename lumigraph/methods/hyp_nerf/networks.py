@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ... import kernels
-from ...components.fields.hash_field import DENSITY_LAYERS, HashNumbers, side_by_side
+from ...components.fields.hash_field import COLOUR_LAYERS, DENSITY_LAYERS, GEOMETRY_FEATURES, HashNumbers, side_by_side
 from ...components.fields.layers import truncated_exp
 from ...method import Field
 from ...method.field import Colours, Densities, Directions, Points
@@ -66,8 +66,8 @@ class HashShape:
     @staticmethod
     def of(numbers: HashNumbers, hidden_width: int) -> HashShape:
         n, width = numbers, hidden_width
-        density = (n.width, *[width] * DENSITY_LAYERS, n.geometry_features)
-        colour = (n.geometry_features + n.sh_bands**2, *[width] * n.colour_layers, 3)
+        density = (n.width, *[width] * DENSITY_LAYERS, GEOMETRY_FEATURES)
+        colour = (GEOMETRY_FEATURES + n.sh_bands**2, *[width] * COLOUR_LAYERS, 3)
         return HashShape(n.levels_of(), density, colour, n.sh_bands)
 
     @property

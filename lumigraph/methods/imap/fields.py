@@ -50,11 +50,12 @@ class DistanceTable(HashField):
 
     truncation: scene units; s is 1 that far before a surface, -1 that far behind it
     sharpness:  per truncation
+    layers:     hidden layers of the colour network
     Light that meets the surface at a right angle is then halved exactly at s = 0.
     """
 
-    def __init__(self, numbers: HashNumbers, width: int, space: Box, truncation: float, sharpness: float):
-        super().__init__(numbers, width, space, 1.0)
+    def __init__(self, numbers: HashNumbers, width: int, space: Box, truncation: float, sharpness: float, layers: int):
+        super().__init__(numbers, width, space, 1.0, layers=layers)
         self.truncation, self.sharpness = truncation, sharpness
 
     def distance_of(self, features: Float[Tensor, "point geometry"]) -> Float[Tensor, " point"]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import torch
 import trimesh
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from ...budget import BY_PHOTOGRAPH, Efforts
@@ -19,7 +19,7 @@ from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.fields.level_set import level_set
 from ...components.fields.mesh_picture import Picture, picture
-from ...components.sampling.occupancy import visual_hull
+from ...components.image_based.depth import HULL_BLUR, hull_surface
 from ...components.training.schedules import falling
 from ...datasets.mesh import Mesh
 from ...datasets.scene import Frame, Photograph, Scene
@@ -59,8 +59,7 @@ class Config:
 
 
 SPHERE_RADIUS = 0.5  # of half the box of interest along each axis
-HULL_FINER, HULL_REACH = 2, 4.0  # cells of the hull for one of the first mesh; cells of the hull that distances reach
-HULL_BLUR = 1.0  # cells of deviation by which a hull of cells, and a teacher's distances, are smoothed
+HULL_FINER = 2  # cells of the hull for one of the first mesh
 TEACHER_VIEWS, TEACHER_SIZE = 32, 200  # depth maps of a teacher, and pixels of their longer side
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance
 SOLID = (0.5, 0.5, 0.5)  # grey of a mesh that no photograph has coloured
@@ -115,12 +114,14 @@ class MeshFit(Method):
         super().compile_begin()
         remeshed(sphere(self.frame, 8), 8)
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+    def check_data(self, data: Scene) -> None:
         if data.frame.is_open:
             raise LumigraphError(
                 "mesh-fit fits one closed surface, and this capture goes on to the horizon; train a radiance field, "
                 "or cut the photographs out and give them an alpha channel"
             )
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         if self.config.start == "hull" and data.images.has_alpha:
             self._begin_with(hull(data, self.config.first_cells))
@@ -233,20 +234,12 @@ def sphere(frame: Frame, cells: int) -> Mesh:
 def hull(scene: Scene, cells: int) -> Mesh:
     """The visual hull of photographs with alpha, its stairs smoothed. Raises LumigraphError where nothing is left."""
     resolution = 1 << max(5, math.ceil(math.log2(HULL_FINER * cells * 2 / box_side(scene.frame))))
-    solid = visual_hull(scene, resolution).numpy()
-    low, high = (np.array(corner) for corner in scene.frame.bounds)
-    centres = (np.arange(resolution) + 0.5) * 2 / resolution - 1
-    for axis in range(3):
-        outside = (centres < low[axis]) | (centres > high[axis])
-        solid[(slice(None),) * axis + (outside,)] = False
-    if not solid.any():
+    if (made := hull_surface(scene, resolution)) is None:
         raise LumigraphError(
             "No part of the box is opaque in all photographs, so there is no silhouettes' hull; check poses and alpha, "
             "or give --start sphere"
         )
-    away = (distance_transform_edt(solid) - distance_transform_edt(~solid)).clip(-HULL_REACH, HULL_REACH)
-    values = gaussian_filter(away, HULL_BLUR) - math.sqrt(3) / 2  # by which `visual_hull` is too large
-    return remeshed(level_set(values, np.full(3, 1 / resolution - 1), 2 / resolution), cells)
+    return remeshed(made, cells)
 
 
 def surface_of(teacher: Any, cameras: Camera, cells: int) -> Mesh:

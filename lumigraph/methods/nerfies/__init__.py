@@ -37,13 +37,15 @@ ELASTIC_SCALE = 0.03  # c of the elastic term's robust loss, section 3.3
 BACKGROUND_WEIGHT = 1.0  # weight of background points that must not move, section 3.4
 BACKGROUND_SCALE = 0.001  # c of the background's robust loss, in scene units (the authors' release)
 
+MOMENT_CODE = 8  # numbers of a moment's code, section 4
+SLICE_WIDTH = 64  # channels of the slice's network (Park 2021b, section 5.1)
+
 
 @dataclass(frozen=True)
 class DeformationNumbers:
     """A Config's numbers of the deformation; the paper's (Park 2021)."""
 
     motion: Motion = "se3"  # motion of a point: a screw motion, section 3.2, or a translation; none: only slices
-    moment_code: Annotated[int, between(1, 1024)] = 8  # numbers of a moment's code, section 4; more fit more freely
     moment_waves: bool = False  # codes begin as waves of time, which suits few steps; off: at random, section 4
     deformation_frequencies: Octaves = 8  # m, octaves of the encoding at the end of annealing, section 3.5
     deformation_depth: Layers = 6  # hidden layers, section 4; more cost time
@@ -56,7 +58,6 @@ class DeformationNumbers:
     background_points: Annotated[int, between(1, 1 << 20)] = 16384  # of them in a step
     growth: Share = 0.0  # share of the budget in which later moments join the first (Pumarola 2021); 0: at once
     slice_dimensions: Annotated[int, between(0, 16)] = 0  # ambient dimensions of HyperNeRF's slice; 0: none
-    slice_width: Width = 64  # channels of the slice's network (Park 2021b, section 5.1)
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,10 @@ class Nerfies(FieldMethod):
         with seeded(c.seed):
             canonical = b.build(frame, space, *kinds, **common)
             first = None if b.hashed else b.build(frame, space, *kinds, **common)
-            self.moment_codes = MomentCodes(frame, d.moment_code, d.moment_waves)
-            bands = d.deformation_frequencies, d.moment_code
+            self.moment_codes = MomentCodes(frame, MOMENT_CODE, d.moment_waves)
+            bands = d.deformation_frequencies, MOMENT_CODE
             motion = None if d.motion == "none" else MotionField(space, d.motion, *bands, shape, d.annealing)
-            narrow = d.deformation_depth, d.slice_width, d.deformation_skip
+            narrow = d.deformation_depth, SLICE_WIDTH, d.deformation_skip
             slices = SliceField(space, *bands, narrow, ambient) if ambient else None
         self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
         self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
@@ -118,8 +119,8 @@ class Nerfies(FieldMethod):
     def smallest(cls) -> Any:
         """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
         return changed(Config(), **TINY_BACKBONE, appearance_code=2, deformation_depth=2, deformation_width=16,
-            deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64, background_points=64,
-            slice_dimensions=1, slice_width=16, deformation_rate=0.1)  # fmt: skip
+            deformation_skip=1, deformation_frequencies=4, elastic_samples=64, background_points=64,
+            slice_dimensions=1, deformation_rate=0.1)  # fmt: skip
 
     # Codes
 

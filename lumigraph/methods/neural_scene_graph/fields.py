@@ -15,7 +15,7 @@ from torch.nn.functional import softplus
 
 from ...components.fields.coordinate_field import LatentField, NetworkNumbers
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, GEOMETRY_FEATURES, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP, truncated_exp
 from ...components.fields.spaces import Box, Space
 from ...method.field import Codes, Colours, Densities, Directions, Points
@@ -60,7 +60,7 @@ class HashClassField(HashField):
         self.latent = latent
         self.modulation = nn.Linear(latent, numbers.width, bias=False)
         widths = [hidden_width] * DENSITY_LAYERS
-        self.density_network = MLP(numbers.width + latent, *widths, numbers.geometry_features)
+        self.density_network = MLP(numbers.width + latent, *widths, GEOMETRY_FEATURES)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
         assert code is not None

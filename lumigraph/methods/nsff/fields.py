@@ -10,10 +10,17 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, relu
 
 from ... import kernels
-from ...components.fields.coordinate_field import NetworkNumbers
+from ...components.fields.coordinate_field import DIRECTION_FREQUENCIES, NetworkNumbers
 from ...components.fields.coordinate_network import CoordinateNetwork, SkipNetwork
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, new_table, side_by_side
+from ...components.fields.hash_field import (
+    DENSITY_LAYERS,
+    GEOMETRY_FEATURES,
+    HashField,
+    HashNumbers,
+    new_table,
+    side_by_side,
+)
 from ...components.fields.layers import MLP, Dense, in_chunks
 from ...components.fields.spaces import Space
 from ...components.training.row_optimizers import LazyAdam
@@ -41,7 +48,7 @@ class NetworkField(Field):
         super().__init__()
         n, self.space, self.timed = numbers, space, inputs > 3
         self.encoding = FrequencyEncoding(inputs, n.position_frequencies)
-        self.encode_direction = FrequencyEncoding(3, n.direction_frequencies)
+        self.encode_direction = FrequencyEncoding(3, DIRECTION_FREQUENCIES)
         widths = self.encoding.width, self.encode_direction.width
         self.network = CoordinateNetwork(*widths, n.depth, hidden_width, n.skip_layer, not n.bfloat16)
         self.heads = Dense(hidden_width, heads, exact=True)
@@ -111,7 +118,7 @@ class TimeHash(HashField):
         self.time_levels, self.time_scale = coarse, min(1.0, moments / coarse.finest)
         self.time_tables = nn.ParameterList(new_table(coarse) for _ in PLANES)
         width = n.width + len(PLANES) * coarse.levels * coarse.features
-        self.density_network = MLP(width, *[hidden_width] * DENSITY_LAYERS, n.geometry_features)
+        self.density_network = MLP(width, *[hidden_width] * DENSITY_LAYERS, GEOMETRY_FEATURES)
         self.motion = MotionNetwork(MOTION_BANDS, *MOTION_SHAPE)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:

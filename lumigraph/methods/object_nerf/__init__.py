@@ -23,7 +23,18 @@ from ...components.fields.coordinate_field import CoordinateField, LatentField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
 from ...components.fields.spaces import space_of
-from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...components.instances import (
+    ALONE,
+    BESIDE,
+    LABELS,
+    NOT_AN_INSTANCE,
+    Edit,
+    check_labels,
+    edit_controls,
+    edit_of,
+    labels_of,
+    with_beside,
+)
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.training.photometric import huber
@@ -57,10 +68,11 @@ OBJECT_LAYERS, OBJECT_WIDTH = 4, 128  # hidden layers of the object branch's net
 OBJECT_NETWORK = {"depth": OBJECT_LAYERS, "skip_layer": OBJECT_LAYERS // 2, "hidden_width": OBJECT_WIDTH}
 OBJECT_COLOUR_WEIGHT = 1.0  # weight of an instance's colours, eq. 6
 OBJECT_OPACITY_WEIGHT = 10.0  # weight of an instance's opacity against its mask, eq. 6
-OUTSIDE_WEIGHT = 0.05  # weight of pixels outside a mask in that, section 3.3
+OUTSIDE_WEIGHT = 0.05  # weight of pixels far outside a mask in that, section 3.3; of those beside it: 1
 GUARD_MARGIN = 0.05  # scene units behind a surface, from which on samples teach an object nothing
 CODE_DEVIATION = 1.0  # of codes at first
-OWN_SHARE = 0.5  # of rays that teach the instance they show; the others teach one at random what it does not cover
+OWN_SHARE = 0.5  # of rays that teach the instance they show; the others teach another what it does not cover
+BESIDE_SHARE = 0.25  # of rays that teach an instance close by, where there is one; the others teach one at random
 COUNT_AFTER = 0.3  # share of the budget from which on surfaces count for boxes
 REGION_CELLS = 96  # of the grid that says what goes with an instance, along the longest side of its box
 REGION_THICKNESS = 0.05  # optical thickness of the object branch over a cell, from which on it belongs to it
@@ -85,8 +97,9 @@ class ObjectNeRF(FieldMethod):
             self.branch = narrow.build(frame, space, *kinds, latent=c.code)
         self.sampler = b.sampler(frame, space) if b.hashed else HierarchicalSampler(space, c.rays)
         self.codes = InstanceCodes(c.instances, c.code)
-        self.boxes = InstanceBoxes(c.instances, frame.bounds)
+        self.boxes = InstanceBoxes(c.instances, frame.bounds, space)
         self._regions: dict[tuple[int, int], Tensor] = {}
+        self._labelled: tuple[Scene, Scene] | None = None  # the data, and the same with the layer BESIDE
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -100,13 +113,19 @@ class ObjectNeRF(FieldMethod):
 
     # Learning
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+    def check_data(self, data: Scene) -> None:
         check_labels(data)
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         self.codes.begin(torch.arange(self.config.instances), CODE_DEVIATION, self.random(1))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(self.sampler.batch_size, generator, layers=layers_of(data)).to(self.device)
+        if self._labelled is None or self._labelled[0] is not data:
+            self._labelled = data, with_beside(data)
+        seen = self._labelled[1]
+        layers = tuple(x for x in (LABELS, BESIDE) if x in seen.layers)
+        return seen.sample_rays(self.sampler.batch_size, generator, layers=layers).to(self.device)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Colours of the scene (eq. 2); of one instance along each ray colour, and opacity against its mask (eq. 6)."""
@@ -122,7 +141,8 @@ class ObjectNeRF(FieldMethod):
         if self.progress >= COUNT_AFTER:
             solid = (labels >= 0) & seen.depth.isfinite() & (seen.opacity > 0.5)
             self.boxes.add(batch.rays.at(seen.depth.detach())[solid], labels[solid])
-        return terms | self.object_terms(batch.rays, target, labels, known, seen, generator)
+        asked, near = self.asked(labels, batch.extra.get(BESIDE, torch.full_like(labels, NOT_AN_INSTANCE)), generator)
+        return terms | self.object_terms(batch.rays, target, labels, known, asked, near, seen, generator)
 
     def object_terms(
         self,
@@ -130,19 +150,23 @@ class ObjectNeRF(FieldMethod):
         target: Float[Tensor, "ray 3"],
         labels: Int[Tensor, " ray"],
         known: Bool[Tensor, " ray"],
+        asked: Int[Tensor, " ray"],
+        near: Bool[Tensor, " ray"],
         seen: Rendering,
         generator: torch.Generator,
     ) -> dict[str, Tensor]:
-        """L_obj = sum_k lambda_1 M |C_k - C|^2 + lambda_2 w (O_k - M)^2, of the instance that each ray asks about."""
+        """L_obj = sum_k lambda_1 M |C_k - C|^2 + lambda_2 w (O_k - M)^2, of the instance that each ray asks about.
+
+        asked, near: see `asked`
+        """
         c = self.config
-        asked = self.asked(labels, generator)
         mask = (labels == asked).float()
         look = self.instance_look(rays, asked, generator)
         if c.guided:  # the visible instance itself may lie behind the depth that the scene branch has so far
             guard = torch.where(mask > 0, torch.inf, seen.depth.detach() + GUARD_MARGIN)
             look = kept(look, look.samples.t < guard[look.samples.ray_index])
         own = composite(look.samples, look.density, look.rgb)
-        weight = known * torch.where(mask > 0, 1.0, OUTSIDE_WEIGHT)
+        weight = known * torch.where(near, 1.0, OUTSIDE_WEIGHT)
         colour = (known * mask)[:, None] * (own.rgb - target).square()
         opacity = weight * (own.opacity - mask).square()
         return {
@@ -150,14 +174,19 @@ class ObjectNeRF(FieldMethod):
             "object opacity": OBJECT_OPACITY_WEIGHT * opacity.mean(),
         }
 
-    def asked(self, labels: Int[Tensor, " ray"], generator: torch.Generator) -> Int[Tensor, " ray"]:
-        """The trained instance of each ray: its own, or for half of the rays one of those in the batch."""
+    def asked(
+        self, labels: Int[Tensor, " ray"], beside: Int[Tensor, " ray"], generator: torch.Generator
+    ) -> tuple[Int[Tensor, " ray"], Bool[Tensor, " ray"]]:
+        """The trained instance of each ray: its own, one beside it, or one of those in the batch; and the rays in or
+        beside the mask of theirs."""
         there = labels[labels >= 0].unique()
         if not len(there):
-            return torch.zeros_like(labels)
+            return torch.zeros_like(labels), torch.zeros_like(labels, dtype=torch.bool)
         other = there[torch.randint(len(there), (len(labels),), generator=generator).to(labels.device)]
-        own = (torch.rand(len(labels), generator=generator) < OWN_SHARE).to(labels.device)
-        return torch.where(own & (labels >= 0), labels, other)
+        share = torch.rand(len(labels), generator=generator).to(labels.device)
+        close = (share >= OWN_SHARE) & (share < OWN_SHARE + BESIDE_SHARE) & (beside >= 0)
+        asked = torch.where((share < OWN_SHARE) & (labels >= 0), labels, torch.where(close, beside, other))
+        return asked, close | (asked == labels)
 
     def instance_look(self, rays: Rays, numbers: Int[Tensor, " ray"], generator: torch.Generator | None = None) -> Look:
         """Samples of the object branch, with the code of an instance for each ray."""
@@ -193,7 +222,7 @@ class ObjectNeRF(FieldMethod):
             return self.instance_at(rays, edit.number, Similarity.make(1.0))
         looks = [self.without(rays, edit.number) if edit.leaves else super().looks(rays)[-1]]
         if edit.appears:
-            place = edit.place(self.boxes.box(edit.number).mean(0))
+            place = edit.place(self.boxes.points(self.boxes.box(edit.number).mean(0)[None])[0][0])
             looks.append(self.instance_at(rays, edit.number, place))
         return union(looks)
 
@@ -214,7 +243,8 @@ class ObjectNeRF(FieldMethod):
         look = self.instance_look(local, numbers)
         points, _ = look.samples.along(local)
         low, high = self.boxes.box(number)
-        return kept(look, ((points >= low) & (points <= high)).all(-1))
+        there = self.boxes.coordinates(points)
+        return kept(look, ((there >= low) & (there <= high)).all(-1))
 
     @torch.no_grad()
     def belongs(self, points: Float[Tensor, "point 3"], number: int) -> Bool[Tensor, " point"]:
@@ -222,7 +252,7 @@ class ObjectNeRF(FieldMethod):
         low, high = self.boxes.box(number)
         sides = ((high - low) / (high - low).max() * REGION_CELLS).ceil().long().clamp_min(1)
         region = self._region(number, low, high, sides)
-        cell = ((points - low) / (high - low) * sides).floor().long()
+        cell = ((self.boxes.coordinates(points) - low) / (high - low) * sides).floor().long()
         inside = ((cell >= 0) & (cell < sides)).all(-1)
         x, y, z = torch.where(inside[:, None], cell, 0).unbind(-1)
         return inside & region[x, y, z]
@@ -234,11 +264,11 @@ class ObjectNeRF(FieldMethod):
         if (found := self._regions.get((number, state))) is not None:
             return found
         axes = [(torch.arange(int(n), device=self.device) + 0.5) / n for n in sides]
-        points = low + (high - low) * torch.cartesian_prod(*axes)
+        points, units = self.boxes.points(low + (high - low) * torch.cartesian_prod(*axes))
         code = self.codes.rows[number][None]
         parts = [self.branch.density(x, code.expand(len(x), -1)) for x in points.split(1 << 16)]
-        edge = float(((high - low) / sides).max())
-        filled = (torch.cat(parts).view(*sides.tolist()) * edge > REGION_THICKNESS).float()
+        edge = units * ((high - low) / sides).max()
+        filled = (torch.cat(parts) * edge > REGION_THICKNESS).view(*sides.tolist()).float()
         size = 2 * REGION_DILATION + 1
         found = max_pool3d(filled[None, None], size, 1, REGION_DILATION)[0, 0] > 0
         self._regions = {(number, state): found}

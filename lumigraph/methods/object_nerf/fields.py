@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ...components.fields.coordinate_field import CoordinateField
-from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, GEOMETRY_FEATURES, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP
 from ...components.fields.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
-BINS = 64  # of each axis of the box of interest, in which seen surfaces are counted
+BINS = 64  # of each half of the coordinates along an axis, in which seen surfaces are counted; of all for an object
 BOX_SHARE = 0.02  # of an instance's seen surface that may lie outside its box, on each side
-BOX_MARGIN = 0.03  # of the box of interest's sides, around an instance's box
+BOX_MARGIN = 0.03  # of the sides of the box of interest, around an instance's box
 
 
 class ObjectTable(HashField):
@@ -29,7 +29,7 @@ class ObjectTable(HashField):
     def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, latent: int):
         super().__init__(numbers, hidden_width, space, reach)
         layers = [hidden_width] * DENSITY_LAYERS
-        self.density_network = MLP(numbers.width + latent, *layers, numbers.geometry_features)
+        self.density_network = MLP(numbers.width + latent, *layers, GEOMETRY_FEATURES)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
         assert code is not None
@@ -64,35 +64,62 @@ class SceneWithout(Field):
 
 
 class InstanceBoxes(nn.Module):
-    """Boxes of instances, from their visible surface points: a histogram along each axis."""
+    """Boxes of instances in the space's coordinates, from their visible surface points: a histogram along each axis.
 
+    counts: two rows of an instance hold both halves of a contracted space; runs saved before boxes were contracted have
+            one row, for the box of interest
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("counts",)
     counts: Tensor
 
-    def __init__(self, instances: int, bounds: tuple[Any, Any]):
+    def __init__(self, instances: int, bounds: tuple[Any, Any], space: Space):
         super().__init__()
-        self.bounds = bounds
-        self.register_buffer("counts", torch.zeros(instances, 3, BINS))
+        self.instances, self.bounds, self.space = instances, bounds, space
+        self.register_buffer("counts", torch.zeros((1 + space.is_open) * instances, 3, BINS))
+
+    @property
+    def contracted(self) -> bool:
+        return len(self.counts) > self.instances
+
+    def coordinates(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Coordinates of points, in which boxes are."""
+        return self.space.warp(points) if self.contracted else points
+
+    def points(self, coordinates: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """Points with these coordinates, and scene units in a unit of coordinates there."""
+        points = self.space.unwarp(coordinates) if self.contracted else coordinates
+        return points, 1 / self.space.stretch(points) if self.contracted else torch.ones_like(points[:, 0])
+
+    def _sides(self) -> tuple[Tensor, Tensor, int]:
+        """Lower corner and sides of what the histograms cover, and their bins along an axis."""
+        low, high = self.counts.new_tensor(((-1.0,) * 3, (1.0,) * 3) if self.contracted else self.bounds)
+        return low, high - low, BINS * len(self.counts) // self.instances
 
     @torch.no_grad()
     def add(self, points: Float[Tensor, "point 3"], labels: Int[Tensor, " point"]) -> None:
         """Add surface points to the histograms."""
-        low, high = points.new_tensor(self.bounds)
-        bins = (BINS * (points - low) / (high - low)).floor().long()
-        inside = ((bins >= 0) & (bins < BINS)).all(-1)
+        low, side, count = self._sides()
+        bins = (count * (self.coordinates(points) - low) / side).floor().long()
+        inside = ((bins >= 0) & (bins < count)).all(-1)
         bins, labels = bins[inside], labels[inside]
-        axis = torch.arange(3, device=bins.device)
-        place = ((labels[:, None] * 3 + axis) * BINS + bins).flatten()
+        row = labels[:, None] * (count // BINS) + bins // BINS
+        place = ((row * 3 + torch.arange(3, device=bins.device)) * BINS + bins % BINS).flatten()
         self.counts.view(-1).index_add_(0, place, torch.ones_like(place, dtype=self.counts.dtype))
+
+    def _counted(self) -> Float[Tensor, "label 3 bin"]:
+        return self.counts.unflatten(0, (self.instances, -1)).movedim(1, 2).flatten(2)
 
     @property
     def learnt(self) -> Bool[Tensor, " label"]:
         """Instances with a box."""
-        return self.counts[:, 0].sum(-1) > 0
+        return self._counted()[:, 0].sum(-1) > 0
 
     def box(self, number: int) -> Float[Tensor, "2 3"]:
-        """Lower and upper corner around all but a share of an instance's surface."""
-        low, high = self.counts.new_tensor(self.bounds)
-        shares = self.counts[number].cumsum(-1) / self.counts[number].sum(-1, keepdim=True).clamp_min(1)
+        """Lower and upper corner, in coordinates, around all but a share of an instance's surface."""
+        (low, side, count), counted = self._sides(), self._counted()[number]
+        shares = counted.cumsum(-1) / counted.sum(-1, keepdim=True).clamp_min(1)
         first, last = (shares <= BOX_SHARE).sum(-1), (shares < 1 - BOX_SHARE).sum(-1) + 1
-        side = high - low
-        return torch.stack([low + side * (first / BINS - BOX_MARGIN), low + side * (last / BINS + BOX_MARGIN)])
+        return torch.stack(
+            [low + side * (end / count + sign * BOX_MARGIN * BINS / count) for end, sign in ((first, -1), (last, 1))]
+        )

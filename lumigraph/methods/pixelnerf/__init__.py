@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -36,7 +37,7 @@ from ...files.ranges import (
     Width,
     between,
 )
-from ...method import Method, RayMethod
+from ...method import RayMethod
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.views import spread_out
@@ -47,14 +48,17 @@ Views = Annotated[int, between(1, 64)]
 POSITION_FREQUENCIES = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
 DEPTH_DEVIATION = 0.01  # standard deviation of these, as a share of the ray's length in the scene
 
+BLOCKS = 5  # residual blocks of the network, appendix B.1
+VIEW_BLOCKS = 3  # blocks of these before the mean over views, appendix B.1
+TARGETS = 4  # photographs of a member that a step's rays come from
+BFLOAT16 = True  # multiply in bfloat16 where the processor is fast at it
+
 
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers (appendix B), with where its published code gives them; below them what saves time."""
 
     hidden_width: Width = 512  # channels of the network's layers, appendix B.1; wider costs memory and time
-    blocks: Annotated[int, between(1, 32)] = 5  # residual blocks of the network, appendix B.1; more cost time
-    view_blocks: Annotated[int, between(1, 32)] = 3  # blocks of these before the mean over views, appendix B.1
     encoder_widths: tuple[Width, Width, Width, Width] = (64, 64, 128, 256)  # channels of ResNet-34's stem and 3 stages
     encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # blocks of the encoder's three stages; more cost time
     encoder_pool: bool = True  # halve the resolution after the encoder's stem; off: finer features, slower
@@ -70,21 +74,15 @@ class Config:
     source_views: Views = 3  # given photographs in a step at most, a random number, section 5.1
     members_per_step: Annotated[int, between(1, 1024)] = 4  # scenes in a step; more reduce noise, and cost time
     rays_per_member: BatchSize = 128  # rays of each scene in a step; more reduce noise, and cost time
-    targets: Views = 4  # photographs of a member that a step's rays come from
     boxed: Share = 0.75  # share of the budget in which rays go through boxes around opaque pixels, appendix B.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     empty_threshold: Share = 0.0  # coarse opacity below which a ray has no fine pass; higher is faster
-    bfloat16: bool = True  # multiply in bfloat16 where the processor is fast at it; off: float32, slower
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.view_blocks > self.blocks:
-            raise LumigraphError(
-                f"--view-blocks {self.view_blocks} are among all --blocks, which are {self.blocks}; give fewer"
-            )
         if self.networks == 2 and not self.coarse_loss_weight:
             raise LumigraphError(
                 "The first of two networks learns from --coarse-loss-weight alone, so it cannot be 0 with --networks 2"
@@ -134,7 +132,7 @@ class PixelNeRF(RayMethod):
         super().__init__(frame, c)
         self.encode = FrequencyEncoding(3, POSITION_FREQUENCIES, base=1.5)
         self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
-        shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
+        shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, BLOCKS, VIEW_BLOCKS, not BFLOAT16)
         self.networks = torch.nn.ModuleList(ResidualNetwork(*shape) for _ in range(c.networks))
         self.kept = KeptPhotographs(self.encoder.width)
         self._sources: Sources | None = None  # found in what is kept, until a step changes the encoder
@@ -151,7 +149,7 @@ class PixelNeRF(RayMethod):
     @classmethod
     def smallest(cls) -> Any:
         return Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16,
-            blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2,
+            density="softplus", density_scale=5.0, source_views=2,
             coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96,
             learning_rate=1e-2, final_learning_rate=3e-3)  # fmt: skip
 
@@ -160,7 +158,7 @@ class PixelNeRF(RayMethod):
         """Activations that a step keeps for its gradients."""
         c = config
         samples = c.members_per_step * c.rays_per_member * (c.coarse_samples + c.fine_samples + c.depth_samples)
-        return 4 * samples * c.hidden_width * 3 * (c.source_views * c.view_blocks + c.blocks) if learning else 0
+        return 4 * samples * c.hidden_width * 3 * (c.source_views * VIEW_BLOCKS + BLOCKS) if learning else 0
 
     # Learning
 
@@ -184,7 +182,7 @@ class PixelNeRF(RayMethod):
             order = there[torch.randperm(len(there), generator=generator)].tolist()
             lesson.sources.append([scene.photograph(i).to(self.device) for i in order[:views]])
             seen = order[views:] or order
-            targets = [scene.photograph(i) for i in seen[: c.targets]]
+            targets = [scene.photograph(i) for i in seen[:TARGETS]]
             rays = rays_through(targets, c.rays_per_member, self._boxed, generator)
             lesson.batches.append(rays.to(self.device))
             lesson.frames.append(scene.frame)
@@ -223,25 +221,21 @@ class PixelNeRF(RayMethod):
     def evidence_views(self) -> int | None:
         return int(float(self.control("views"))) if self.controls else 1
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """A field of a scene, conditioned on its training photographs; or the same one, on fewer of them."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, PixelNeRF)
-        told._sources = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("views", None)
-            told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Condition the field on a scene's training photographs, or on fewer of them."""
+        self._sources = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("views", None)
+            self.kept = self._keeping(scene, len(scene.splits["train"])).to(self.device)
             with torch.no_grad():
-                told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
-        return told
+                self.kept.found.rows = self._features(self.kept.pictures()).flatten(0, 2)
 
     def evidence_bytes(self, scene: Scene) -> int:
         """Bytes of the photographs and their features."""
         sizes = scene.cameras.size[scene.splits["train"]]
         cells = len(sizes) * int(torch.ceil(sizes.amax(0) / STRIDE).prod())
-        numbers = self.encoder.width * 4 + len(self.networks) * self.config.view_blocks * self.config.hidden_width
+        numbers = self.encoder.width * 4 + len(self.networks) * VIEW_BLOCKS * self.config.hidden_width
         return 4 * cells * numbers
 
     def _keeping(self, scene: Scene, most: int) -> KeptPhotographs:

@@ -34,6 +34,8 @@ STOPS = {"mean": 1e-4, "median": 0.5}  # transmittance at which the planes of a 
 FLATNESS_WEIGHT = 100.0  # lambda_1, weight of the smallest scales; higher: flatter Gaussians
 NEAR_VIEWS = 8  # nearest photographs, of which a step draws the other view
 
+POSE_LEARNING_RATE = 5e-3  # radians that a step moves a picture at most
+
 
 @dataclass(frozen=True)
 class PlaneNumbers:
@@ -63,7 +65,7 @@ class Config:
     cloud: CloudNumbers = CloudNumbers()
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     planes: PlaneNumbers = PlaneNumbers()
-    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    poses: PoseNumbers = PoseNumbers()
     measured: DepthNumbers = DepthNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -128,7 +130,7 @@ class PlanarSplatting(CloudMethod):
         self.planes = Planes(c.planes)
         self.density_control = AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, len(self.cloud))
         self.tidying = Tidying(c.tidying)
-        self.poses = poses_for(frame, c.poses)
+        self.poses = poses_for(frame, c.poses, POSE_LEARNING_RATE)
 
     @classmethod
     def cpu_preset(cls) -> Any:

@@ -26,13 +26,8 @@ from ...exchange.baked import Octree
 from ...exchange.packing import most_important
 from ...files.ranges import (
     BatchSize,
-    Depth,
-    Layers,
     LearningRate,
     NonNegative,
-    Octaves,
-    Positive,
-    PositiveShare,
     Seed,
     Share,
     Width,
@@ -46,6 +41,12 @@ from .baking import Baking, averaged_harmonics, bake, fill, met
 from .harmonic_field import HarmonicHash, HarmonicNetwork, HarmonicTeacher
 from .leaves import LeafSampler, Leaves, ask_for_octree
 
+DEPTH = 8  # hidden layers of the network, as in NeRF
+POSITION_FREQUENCIES = 10  # octaves of positions of the network
+HIDDEN_LAYERS = 2  # hidden layers after the hash table
+SPARSITY_LENGTH = 0.05  # lambda of eq. 4: scene units over which that density absorbs light
+WEIGHT_THRESHOLD = 1e-3  # least weight of a leaf on some ray, section 4.1
+
 
 @dataclass(frozen=True)
 class Config:
@@ -54,13 +55,9 @@ class Config:
     table: TableNumbers = TableNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers(transmittance_threshold=0.01)  # of all stages; section 4.2
     field: Literal["hash", "network"] = "network"  # first field: the paper's network, or a faster hash table
-    depth: Depth = 8  # hidden layers of the network, as in NeRF; more hold more detail, and cost time
-    position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hidden_width: Width = 256  # channels of a hidden layer, of either field; wider costs memory and time
-    hidden_layers: Layers = 2  # hidden layers after the hash table; more cost time
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands, section 5.1: 4 have 16 coefficients
     sparsity_weight: NonNegative = 1e-3  # weight of density at random points, eq. 4; higher empties more; the release's
-    sparsity_length: Positive = 0.05  # lambda of eq. 4: scene units over which that density absorbs light
     sparsity_points: Annotated[int, between(1, 1 << 20)] = 10_000  # K, random points of eq. 4; more cost time
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the cube's diagonal, first stage
     learning_rate: LearningRate = 5e-4  # the field's learning rate at first, section 5.1; higher may diverge
@@ -69,7 +66,6 @@ class Config:
     teacher_share: Share = 0.9  # share of the budget after which the field is baked; the leaves have the rest
     octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1, to a pixel's size at most
     leaf_points: Annotated[int, between(1, 4096)] = 256  # points of a leaf that are averaged, section 4.1
-    weight_threshold: PositiveShare = 1e-3  # least weight of a leaf on some ray, section 4.1; higher drops more leaves
     rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -103,10 +99,10 @@ class PlenOctrees(FieldMethod):
             )
         with seeded(c.seed):
             if c.field == "hash":
-                self.teacher = HarmonicHash(c.table, c.hidden_layers, c.hidden_width, c.sh_bands)
+                self.teacher = HarmonicHash(c.table, HIDDEN_LAYERS, c.hidden_width, c.sh_bands)
             else:
-                layers = c.depth, c.hidden_width, SKIP_LAYER
-                self.teacher = HarmonicNetwork(c.position_frequencies, *layers, c.sh_bands)
+                layers = DEPTH, c.hidden_width, SKIP_LAYER
+                self.teacher = HarmonicNetwork(POSITION_FREQUENCIES, *layers, c.sh_bands)
         space, steps = Box(frame.bounds, frame.near), StepNumbers(c.steps_per_diagonal)
         self.teacher_sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps)
         self.leaves = Leaves(c.sh_bands**2)
@@ -132,7 +128,7 @@ class PlenOctrees(FieldMethod):
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
         return changed(Config(TINY_LEVELS), samples_per_step=2048, occupancy_resolution=16, field="hash",
-            hidden_width=16, hidden_layers=1, sh_bands=2, steps_per_diagonal=128, learning_rate=2e-2,
+            hidden_width=16, sh_bands=2, steps_per_diagonal=128, learning_rate=2e-2,
             final_learning_rate=1e-2, sparsity_points=64, teacher_share=0.5, octree_depth=4, leaf_points=2,
             rays_per_step=128)  # fmt: skip
 
@@ -251,7 +247,7 @@ class PlenOctrees(FieldMethod):
     def _baking(self, cameras: Camera) -> Baking:
         """Parameters of baking. The octree is no deeper than a cell for each pixel along the largest picture."""
         c, depth = self.config, math.ceil(math.log2(int(cameras.size.max())))
-        return Baking(min(c.octree_depth, max(depth, 1)), c.leaf_points, c.weight_threshold, self.frame.near)
+        return Baking(min(c.octree_depth, max(depth, 1)), c.leaf_points, WEIGHT_THRESHOLD, self.frame.near)
 
     def _leave_field(self) -> None:
         """Drop the teacher and its sampler."""
@@ -280,7 +276,7 @@ class PlenOctrees(FieldMethod):
         """(1 / K) sum_k |1 - exp(-lambda sigma_k)| at K random points (eq. 4)."""
         points = 2 * torch.rand(self.config.sparsity_points, 3, generator=generator) - 1
         density = self.density(points.to(self.device))
-        return (1 - torch.exp(-self.config.sparsity_length * density)).abs().mean()
+        return (1 - torch.exp(-SPARSITY_LENGTH * density)).abs().mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         teacher, c = self.teacher, self.config

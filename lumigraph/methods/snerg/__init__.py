@@ -32,7 +32,6 @@ from ...files.ranges import (
     Layers,
     LearningRate,
     NonNegative,
-    Octaves,
     PositiveShare,
     Seed,
     Share,
@@ -49,6 +48,8 @@ from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
 from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
+
+POSITION_FREQUENCIES = 10  # octaves of positions of the network
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,6 @@ class Config:
     hidden_layers: Layers = 8  # hidden layers of the field's network; more cost time
     hidden_width: Width = 512  # channels of the field's hidden layers, the release's; wider costs memory and time
     # Of the paper's network.
-    position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -139,7 +139,7 @@ class SNeRG(FieldMethod):
                 self.network = HashDeferred(c.table, c.hidden_layers, c.hidden_width, space, frame.reach)
             else:
                 layers = c.hidden_layers, c.hidden_width, SKIP_LAYER
-                self.network = NetworkDeferred(c.position_frequencies, *layers, space)
+                self.network = NetworkDeferred(POSITION_FREQUENCIES, *layers, space)
             self.view = ViewDependence(c.view_width)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         contracted = contraction_of(frame) if c.whole and frame.is_open else None

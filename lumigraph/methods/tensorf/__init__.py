@@ -44,6 +44,9 @@ APPEARANCE_FEATURES = 27  # P, outputs of the basis matrix B, section 5
 DIRECTION_FREQUENCIES = 2  # octaves of the directions' encoding, the code's
 SH_BANDS = 3  # spherical-harmonics bands, with --shading sh; more cost time
 
+NETWORK_LEARNING_RATE = 1e-3  # rate of basis matrix and network at first, section 5
+FINAL_LEARNING_RATE = 2e-3  # rate of planes and lines at the end of the budget; the others fall alike
+
 
 @dataclass(frozen=True)
 class Config:
@@ -70,8 +73,6 @@ class Config:
     final_l1_weight: NonNegative = 4e-5  # the same once the box has shrunk, the code's
     tv_interval: Steps = 1  # steps between these terms, whose weight is multiplied by it; more are faster
     learning_rate: LearningRate = 0.02  # rate of planes and lines until the last upsampling, section 5
-    network_learning_rate: LearningRate = 1e-3  # rate of basis matrix and network at first, section 5
-    final_learning_rate: LearningRate = 2e-3  # rate of planes and lines at the end of the budget; the others fall alike
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
@@ -213,7 +214,7 @@ class TensoRF(FieldMethod):
             Config(), samples_per_step=4096, occupancy_resolution=16, initial_resolution=8, final_resolution=16,
             open_final_resolution=16, density_components=4, appearance_components=6,
             hidden_width=16, feature_frequencies=1, density_shift=-3.0, step_ratio=1.0,
-            rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)  # fmt: skip
+            rays_per_step=256, learning_rate=0.05)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -254,7 +255,7 @@ class TensoRF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c, network = self.config, self.network
-        group = {"params": network.others, "scale": c.network_learning_rate / max(c.learning_rate, 1e-12)}
+        group = {"params": network.others, "scale": NETWORK_LEARNING_RATE / max(c.learning_rate, 1e-12)}
         tables = [grid.table for grid in network.grids.values()]
         self._optimizer = LazyAdam(tables, c.learning_rate, betas=(0.9, 0.99))
         others = torch.optim.Adam([group], c.learning_rate, betas=(0.9, 0.99), foreach=True)
@@ -263,7 +264,7 @@ class TensoRF(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Constant until the final resolution, then exponential decay."""
         c, last = self.config, UPSAMPLINGS[-1]
-        return falling(c.learning_rate, c.final_learning_rate, max(0.0, progress - last) / (1 - last))
+        return falling(c.learning_rate, FINAL_LEARNING_RATE, max(0.0, progress - last) / (1 - last))
 
     def before_step(self, step: int, progress: float) -> None:
         stage, network = bisect_right(UPSAMPLINGS, progress), self.network
@@ -285,7 +286,7 @@ class TensoRF(FieldMethod):
         grids = [grid.table for grid in network.grids.values()]
         optimizers = [
             LazyAdam(grids, c.learning_rate, betas=(0.9, 0.99)),
-            torch.optim.Adam(network.others, c.network_learning_rate, betas=(0.9, 0.99)),
+            torch.optim.Adam(network.others, NETWORK_LEARNING_RATE, betas=(0.9, 0.99)),
         ]
         points = c.occupancy.samples_per_step // SAMPLES_PER_POINT
         distil(self.field, known, network.space, optimizers, points, chance, self.device)

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from PIL import Image
 
+from ...color.tags import save_srgb
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry import evenly
 from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, srgb_image
-from ...readers.profiles import SRGB_PROFILE
 from ...readers.raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track
 
@@ -96,7 +96,7 @@ def write(photo: RawPhoto, brightness: float, target: Path) -> None:
     picture = Image.fromarray(photo.developed(brightness))
     exif = exif_of(photo.path)
     with replacing(target, ours=True) as partial:
-        picture.save(partial, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
+        save_srgb(picture, partial, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
         stat = photo.path.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
@@ -137,9 +137,9 @@ def copy_upright(image: Image.Image, source: Path, path: Path) -> None:
 def save(image: Image.Image, path: Path, suffix: str) -> None:
     """Write an image in sRGB as JPEG or PNG, as a suffix says."""
     if suffix.lower() in JPEG_SUFFIXES:
-        image.save(path, "JPEG", icc_profile=SRGB_PROFILE, quality=JPEG_QUALITY, subsampling=0)
+        save_srgb(image, path, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     else:
-        image.save(path, "PNG", icc_profile=SRGB_PROFILE)
+        save_srgb(image, path)
 
 
 def is_current(path: Path, source: Path) -> bool:
