@@ -16,6 +16,7 @@ import torch
 from budgets import budget
 from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_nerfstudio, write_ngp
 from PIL import Image
+from PIL.JpegImagePlugin import JpegImageFile
 
 from lumigraph.camera.lens import Pinhole
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -25,7 +26,7 @@ from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.large import open_any
 from lumigraph.opening import read_capture
-from lumigraph.readers import choose_reader, colmap, light_field, phones, transforms
+from lumigraph.readers import choose_reader, colmap, light_field, phones, pictures, transforms
 from lumigraph.readers.capture import checked_pose
 from lumigraph.readers.finding import find_named, paired
 from lumigraph.readers.meshes import read_mesh
@@ -179,6 +180,19 @@ def test_photographs_are_known_by_their_content(tmp_path, kind, suffix):
     Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / f"a{suffix}", format=kind)
     found = find_file(tmp_path / "a")
     assert found.suffix == suffix and read_image(found, True, (30, 20)).mean() == pytest.approx(90, abs=2)
+
+
+def test_a_large_jpeg_is_decoded_reduced(tmp_path, monkeypatch):
+    y, x = np.mgrid[:480, :640]
+    whole = np.stack([x / 3, y / 2, 99 + 0 * x], -1).astype(np.uint8)
+    Image.fromarray(whole).save(tmp_path / "a.jpg", quality=95)
+    before = read_image(tmp_path / "a.jpg", False, (64, 48)).astype(float)
+    drafts: list[tuple] = []
+    draft = JpegImageFile.draft
+    monkeypatch.setattr(JpegImageFile, "draft", lambda *given: drafts.append(draft(*given)))
+    monkeypatch.setattr(pictures, "LARGE", 100_000)
+    after = read_image(tmp_path / "a.jpg", False, (64, 48)).astype(float)
+    assert len(drafts) == 1 and np.abs(after - before).mean() < 1
 
 
 def test_depth_of_floats_keeps_its_numbers(tmp_path):

@@ -76,10 +76,6 @@ class Sparse(msgspec.Struct):
     values: SparsePart
     count: Tally
 
-    @property
-    def parts(self) -> list[tuple[int, int, int]]:
-        return [(x.buffer_view, x.byte_offset, x.component_type) for x in (self.indices, self.values)]
-
 
 class Buffer(msgspec.Struct, rename="camel"):
     byte_length: Tally
@@ -258,8 +254,8 @@ def refuse_compressed(path: Path) -> None:
             "for instance from Blender, which opens it"
         )
     if f'"{KTX2}"'.encode() in text:
-        text = f"{path} has textures of KTX2, which are not read; colours are those of its materials"
-        warnings.warn(text, LumigraphWarning, 3)
+        told = f"{path} has textures of KTX2, which are not read; colours are those of its materials"
+        warnings.warn(told, LumigraphWarning, 3)
 
 
 def plain(path: Path) -> bytes:
@@ -386,10 +382,11 @@ class File:
             found = self._stored(index, *place, dtype, width).astype(np.float32)
         if accessor.sparse is not None:
             with reading(self.path, "has a sparse accessor that contradicts itself", "export it again"):
-                there, values = typed(Sparse, accessor.sparse, self.path).parts
-                count = accessor.sparse["count"]
-                rows = self._stored(index, *there[:2], count, np.dtype(KINDS[there[2]]), 1)[:, 0]
-                found[rows] = self._stored(index, *values[:2], count, dtype, width)
+                said = typed(Sparse, accessor.sparse, self.path)
+                there, values, kind = said.indices, said.values, KINDS[said.indices.component_type]
+                rows = self._stored(index, there.buffer_view, there.byte_offset, said.count, np.dtype(kind), 1)[:, 0]
+                changed = self._stored(index, values.buffer_view, values.byte_offset, said.count, dtype, width)
+                found[rows] = changed
         if accessor.normalized and dtype.kind in "iu":
             found = np.maximum(found / np.float32(np.iinfo(dtype).max), -1)
         return found

@@ -44,7 +44,8 @@ def read(folder: Path) -> Capture:
         found = ", ".join(f"{len(names)} in {place.name}" for place, names in listed.items()) or "no folder of images"
         raise LumigraphError(f"{path} has poses of {len(table)} images, but there are {found}; restore the images")
     moving = (folder / OTHER_VIEWS).is_dir()
-    shots, bend = [], bend_of(folder / "sparse/0/cameras.bin")
+    shots: list[Shot] = []
+    bend = bend_of(folder / "sparse/0/cameras.bin")
     for name, files, line in zip(names, versions(folders, names), table, strict=True):
         (pose, (width, height, focal)), depths = camera_of(line), line[15:]
         if not (np.isfinite(line).all() and 1 <= min(height, width) and max(height, width) <= 1e5 and focal > 0):
