@@ -121,11 +121,6 @@ class Loops(Part):
         return optimised(poses.double(), edges, motions.double(), self.unit).to(poses)
 
 
-def moved(pose: Pose, motion: Pose) -> Pose:
-    """Pose after a motion in its own frame."""
-    return torch.cat([pose[:, :3] @ motion[:, :3], (pose[:, :3] @ motion[:, 3] + pose[:, 3])[:, None]], -1)
-
-
 def motion(first: Pose, second: Pose) -> Pose:
     """Pose of the second in the frame of the first."""
     turn, shift = relative(first, second)

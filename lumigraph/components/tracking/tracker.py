@@ -18,8 +18,8 @@ from ...files.ranges import Share, between
 from ...method import Part
 from .alignment import sensor_deviation
 from .frames import DepthFrame, Moment, order_of
-from .loops import TOLERANCE, FramePlaces, Loops, motion_between, moved
-from .trajectory import KNOWN, Pose, Trajectory, angle, relative
+from .loops import TOLERANCE, FramePlaces, Loops, motion_between
+from .trajectory import KNOWN, Pose, Trajectory, angle, moved, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
 MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
@@ -173,7 +173,8 @@ class Tracker(Part):
         for other in others():
             found = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
             if found is not None:
-                yield moved(self.trajectory.poses[other.index], found.to(self.trajectory.poses))
+                found = found.to(self.trajectory.poses)
+                yield moved(self.trajectory.poses[other.index], found[:, :3], found[:, 3])
 
     @torch.no_grad()
     def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:
