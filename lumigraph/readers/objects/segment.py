@@ -38,7 +38,7 @@ COLOUR_RANGE = 50.0  # CIELAB units along each axis, over which an object's colo
 MIN_REST_VIEWS, MAX_REST_VIEWS = 3, 24  # photographs that show it at a pixel; photographs that are compared
 MIN_REST_SHARE = 0.8  # share of the background's pixels that agree with it
 SURE_REST = 3.0  # log-likelihood ratio of pixels that are background wherever they lie
-REST_ROUNDS, REST_PIXELS = 4, 3  # of outlines by pixels; pixels that an outline may grow in each
+REST_PIXELS = 3  # by which an outline may grow
 MIN_CELLS = 20  # of a body
 MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
@@ -168,13 +168,12 @@ def at_rest(views: Sequence[ObjectView], masks: Sequence[Mask]) -> list[Float[np
 def outlined(views: Sequence[ObjectView], inside: Sequence[Patches]) -> list[Mask]:
     """Masks of the superpixels, corrected by pixels before a background at rest: outside is what agrees with it and is
     connected to the outside, or agrees surely; inside is what disagrees close to the object."""
-    masks = [own[view.patches] for view, own in zip(views, inside, strict=True)]
-    for _ in range(REST_ROUNDS):
-        for i, ratio in enumerate(at_rest(views, masks)):
-            smooth, mask = ndimage.gaussian_filter(ratio, 1.0), masks[i]
-            outside = ndimage.binary_propagation(~mask, mask=~mask | (smooth > 0)) | (smooth > SURE_REST)
-            masks[i] = ndimage.binary_dilation(~outside, mask=~outside | (smooth < 0), iterations=REST_PIXELS)
-    return masks
+    masks, found = [own[view.patches] for view, own in zip(views, inside, strict=True)], []
+    for mask, ratio in zip(masks, at_rest(views, masks), strict=True):  # once: a vase looks alike from all sides
+        smooth = ndimage.gaussian_filter(ratio, 1.0)
+        outside = ndimage.binary_propagation(~mask, mask=~mask | (smooth > 0)) | (smooth > SURE_REST)
+        found.append(ndimage.binary_dilation(~outside, mask=~outside | (smooth < 0), iterations=REST_PIXELS))
+    return found
 
 
 def distinctness(views: Sequence[ObjectView], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
