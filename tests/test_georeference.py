@@ -66,6 +66,7 @@ def test_a_run_remembers_the_frame_of_its_exports(ball_run, tmp_path):
     again = Run(tmp_path / "run").frame
     torch.testing.assert_close(again.to_export.matrix, (WORLD @ again.to_source).matrix)
     assert again.scale == pytest.approx(3.7)
+    assert len(Run(tmp_path / "run").scene()) == len(ball_run.scene()), "its photographs are no others"
     run.set_scale(2.0)
     assert Run(tmp_path / "run").frame.to_export.scale == pytest.approx(2 * again.to_source.scale)
 
