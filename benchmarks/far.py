@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +25,9 @@ from foreign.packages import laspy, usd
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from lumigraph.camera import Camera
 from lumigraph.commands.cli import main as main_of
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation.control_points import own_size
 from lumigraph.exchange import offset_file, read_gaussians, spz
 from lumigraph.exchange.codes import TURN_MEAN
 from lumigraph.files.ply import columns, read_rows
@@ -40,10 +40,9 @@ from lumigraph.system.console import console
 UTM = np.array([500_000.0, 5_200_000.0, 300.0])
 SPLATS = ("a.ply", "a.glb", "a.spz", "a.splat", "a.compressed.ply", "a.sog")
 LAYERS = ("a.usdc", "a.usda")
-CONTROL = Similarity.make(2.5, torch.linalg.matrix_exp(torch.tensor([[0, 0.4, 0.1], [-0.4, 0, 0.2], [-0.1, -0.2, 0]])),
-                          torch.tensor([412_345.0, 5_654_321.0, 87.0], dtype=torch.float64))  # fmt: skip
-
-
+TURN = torch.linalg.matrix_exp(torch.tensor([[0, 0.4, 0.1], [-0.4, 0, 0.2], [-0.1, -0.2, 0]], dtype=torch.float64))
+ZONE = torch.tensor([412_345.0, 5_654_321.0, 87.0], dtype=torch.float64)
+CONTROL = Similarity.make(2.5, TURN, ZONE) @ Similarity.make(1.0, translation=torch.from_numpy(-UTM))
 CONTROL_POINTS, VIEWS, APART = 5, 3, 0.3  # scene units between control points
 
 
@@ -178,7 +177,7 @@ def survey(run: Path, cloud: Gaussians, exact: np.ndarray, output: Path) -> None
         point = cloud.means[i].numpy()
         if len(taken) == CONTROL_POINTS or np.linalg.norm(point) > 1:  # outside the box of interest
             continue
-        pixels = [(name, seen_at(scene.cameras[k], point)) for k, name in enumerate(scene.names)]
+        pixels = [(name, seen_at(scene, k, point)) for k, name in enumerate(scene.names)]
         seen = [(name, *pixel) for name, pixel in pixels if pixel is not None]
         if len(seen) < VIEWS or any(np.linalg.norm(point - other) < APART for other in taken):
             continue
@@ -197,16 +196,16 @@ def survey(run: Path, cloud: Gaussians, exact: np.ndarray, output: Path) -> None
     console().print(f"{path.name}: errors {np.median(error):.2g} (median), {error.max():.2g} of a Gaussian's size")
 
 
-def seen_at(camera: Camera, point: np.ndarray) -> tuple[float, float] | None:
-    """Pixel of a point, where it is within a photograph."""
+def seen_at(scene: Scene, number: int, point: np.ndarray) -> tuple[float, float] | None:
+    """Pixel of a point in a photograph of its own size, where it is within."""
+    camera = scene.cameras[number]
     pose = camera.pose[0].double()
     local = (torch.from_numpy(point).double() - pose[:, 3]) @ pose[:, :3]
     if local[2] <= 0.1:
         return None
-    pixel, _ = camera.lens.project(local[None].float())
-    u, v = pixel[0].tolist()
-    width, height = camera.size[0].tolist()
-    return (u, v) if 0 < u < width and 0 < v < height and math.isfinite(u + v) else None
+    pixel = (camera.lens.project(local[None].float())[0][0] / camera.size[0] * own_size(scene, number)).tolist()
+    inside = all(0 < x < most for x, most in zip(pixel, own_size(scene, number).tolist(), strict=True))
+    return (pixel[0], pixel[1]) if inside else None
 
 
 if __name__ == "__main__":

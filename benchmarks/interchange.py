@@ -368,7 +368,7 @@ def page_table(rows: list[dict[str, Any]], date: str) -> str:
     for one in rows:
         if one["cloud"] != "surface":
             both.setdefault((one["format"], one["reader"]), []).append(one)
-    for (kind, reader), found in both.items():
+    for (kind, reader), found in sorted(both.items(), key=lambda one: [*FORMATS].index(one[0][0])):
         places = [f"{one['errors']['position']:.1g}" if one["errors"] else one["fault"] for one in found]
         rest = [[one["errors"][x] for one in found if x in one["errors"]] for x in QUANTITIES[1:6]]
         lines.append(

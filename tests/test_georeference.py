@@ -57,7 +57,7 @@ def test_points_give_scale_turn_and_offset(ball_run, tmp_path):
     assert 1e-3 < rough.rms < 1
 
 
-def test_a_run_remembers_the_frame_of_its_exports(ball_run, tmp_path):
+def test_a_run_remembers_the_frame_of_its_exports(ball_run, tmp_path, monkeypatch):
     import shutil
 
     shutil.copytree(ball_run.folder, tmp_path / "run")
@@ -66,6 +66,9 @@ def test_a_run_remembers_the_frame_of_its_exports(ball_run, tmp_path):
     again = Run(tmp_path / "run").frame
     torch.testing.assert_close(again.to_export.matrix, (WORLD @ again.to_source).matrix)
     assert again.scale == pytest.approx(3.7)
+    scene = tiny.scene()
+    monkeypatch.setattr("lumigraph.run.folder.open_dataset", lambda *_, **__: scene)
+    assert Run(tmp_path / "run").scene() is scene, "its photographs are no others"
     run.set_scale(2.0)
     assert Run(tmp_path / "run").frame.to_export.scale == pytest.approx(2 * again.to_source.scale)
 
