@@ -107,11 +107,11 @@ def camera_of(folder: Path) -> tuple[Lens, float]:
             said: dict[str, Any] = read_json(path)
             said = said.get("camera", said)
             unit = float(said.get("scale", said.get("depth_scale", unit)))
+            unit = 1 / unit if 0 < unit < 1 else unit  # RealSense gives metres of a unit
             if "intrinsic_matrix" in said:  # column after column
                 return pinhole(*np.array(said["intrinsic_matrix"]).reshape(3, 3)[[0, 1, 2, 2], [0, 1, 0, 1]]), unit
-            return pinhole(
-                said["fx"], said["fy"], said.get("cx", said.get("ppx")), said.get("cy", said.get("ppy"))
-            ), unit
+            cx, cy = (said[name if name in said else other] for name, other in (("cx", "ppx"), ("cy", "ppy")))
+            return pinhole(said["fx"], said["fy"], cx, cy), unit
     raise LumigraphError(
         f"{folder} has colours and depth and does not say its camera: looked for camera.txt, {', '.join(MATRICES)} and "
         f"{', '.join(RECORDS)}; write {folder / 'camera.txt'} with fx fy cx cy in pixels, and behind them the "

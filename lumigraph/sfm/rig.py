@@ -159,10 +159,10 @@ def capture_recorded(
     ]
     with replacing_folder(folder, "capture") as partial:
         (partial / "rgb").mkdir(parents=True)
-        taken = track(picked(source / RECORDED_FILM, chosen, tags), "Taking frames", len(chosen))
-        written = [
-            (number, save(picture, partial / "rgb" / f"{number:06}.jpg", ".jpg"))[0] for number, picture, _ in taken
-        ]
+        written = []
+        for number, picture, _ in track(picked(source / RECORDED_FILM, chosen, tags), "Taking frames", len(chosen)):
+            save(picture, partial / "rgb" / f"{number:06}.jpg", ".jpg")
+            written.append(number)
         for kind in ("depth", "confidence"):
             for file in (found for number in written if (found := phones.find_measured(source / kind, number))):
                 (partial / kind).mkdir(exist_ok=True)
