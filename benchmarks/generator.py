@@ -114,7 +114,7 @@ def fid_over_training(options: Options, run: Run, data: Collection, folder: Path
 
 def sheet(options: Options, method: EG3D, folder: Path) -> None:
     around = turned(method.viewpoint, 4)
-    drawn = [method.drawn(seed) for seed in range(options.seeds)]
+    drawn = [method.draw_object(seed) for seed in range(options.seeds)]
     rows = [Row(f"seed {i}", [magnified(one.render(around[k]).rgb) for k in range(4)]) for i, one in enumerate(drawn)]
     title = f"{options.seeds} drawn objects, four views each"
     save_picture(folder / "drawn.png", contact_sheet(title, ["0°", "90°", "180°", "270°"], rows))
@@ -156,7 +156,7 @@ def consistency(options: Options, method: EG3D, folder: Path) -> dict[str, Any]:
         for angle in ANGLES:
             scores, constants, shares = [], [], []
             for seed in range(options.seeds):
-                shown = method.drawn(seed).given(picture=picture)
+                shown = method.draw_object(seed).given(picture=picture)
                 both = turned(method.viewpoint, 360 // angle)[slice(2)]
                 close, constant, visible, pictures = carried(shown, both[0], both[1])
                 scores.append(close)

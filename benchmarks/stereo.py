@@ -77,9 +77,6 @@ def main(folder: Path) -> None:
         report(f"OpenCV's {name}", taken, error, (given >= 0)[known])
     found, taken = seconds(lambda: stereo.semi_global(a, b, 0, DISPARITIES))
     report("`stereo.semi_global`", taken, np.abs(found.values.numpy() - truth)[known], found.sure.numpy()[known])
-    blocks, taken = seconds(lambda: stereo.by_blocks(a, b, 0, DISPARITIES))
-    report("`stereo.by_blocks`", taken, np.abs(blocks.numpy() - truth)[known], np.ones(known.sum(), bool))
-
     print("\n| flow | bad-2.0 | mean error | processor s |\n|---|---|---|---|")
     ways = {f"OpenCV's DIS, preset {k}": cv2.DISOpticalFlow_create(k).calc for k in (0, 1, 2)}
     greys = [cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (left, right)]

@@ -61,7 +61,7 @@ from lumigraph.run import Run
 RESULTS = Path(__file__).parent / "results" / "strangers-cpu.json"
 CELL_SECONDS, WALL_SECONDS = 240, 1200  # of a cell at the most: of the processor, and by the clock
 EVAL_VIEWS, COVERED, SIDE = 4, 0.05, 160  # compared views; relative error of depth; pixels of photographs in --data
-SOLID = 0.5  # opacity of a surface
+SOLID, SHEET_SIDE = 0.5, 240  # opacity of a surface; pixels of pictures in the sheets
 UNSAID = "its score is below the baseline, and no sentence says so"
 V = "size=96,views=24"
 ROOM = "procedural:room,depth,size=120,views="
@@ -152,7 +152,7 @@ GUIDED = ("--guidance", "{data}/captions")
 
 @dataclass(frozen=True)
 class Entry:
-    """A method's line of the table: steps of half a minute or less on an idle core, settings, further options."""
+    """A method's line of the table. steps: of half a minute or less on an idle core, 0 for all frames"""
 
     steps: int
     settings: tuple[str, ...]
@@ -186,7 +186,7 @@ METHODS = {
     "voxel-fit": Entry(200, (*OBJECT, "open, clutter")),
     "neus": Entry(200, (*PLAIN, "tiny unit", "turntable")),
     "planar-splatting": Entry(400, PLAIN),
-    "tsdf-fusion": Entry(60, (*DEPTH, "large steps")),
+    "tsdf-fusion": Entry(0, (*DEPTH, "large steps")),
     "imap": Entry(0, (*DEPTH, "large steps"), command="track"),
     "splat-slam": Entry(0, (*DEPTH, "large steps"), command="track"),
     "nerfies": Entry(200, MOVING),
@@ -234,7 +234,7 @@ class Cell:
 
     def words(self, run: Path) -> list[str]:
         """Arguments of `lumigraph` that train or track it."""
-        steps = [] if self.command == "track" else ["--steps", str(self.steps)]
+        steps = ["--steps", str(self.steps)] if self.steps else []  # all frames of those that see each once
         return [self.command, self.method, self.source, *steps, *self.options, "--output", str(run)]
 
 
@@ -320,7 +320,7 @@ def chosen(options: Options, output: Path) -> Iterator[Cell]:
         for name, entry in entries.items():
             for setting, source, further in settings[name][turn : turn + 1]:
                 if not options.settings or setting in options.settings:
-                    steps = max(1, round(options.budget * entry.steps))
+                    steps = entry.steps and max(1, round(options.budget * entry.steps))
                     told = (*(word.format(data=data) for word in entry.options), *further)
                     yield Cell(name, setting, source, steps, told, entry.command)
 
@@ -401,12 +401,11 @@ def inside(cell: Cell, folder: Path) -> None:
         about = json.loads((folder / ERRORS_FILE).read_text())
         truth = np.loadtxt(folder / TRUTH_FILE)[:, 1:4] if (folder / TRUTH_FILE).exists() else np.zeros((0, 3))
         still = 100 * float(np.sqrt(np.square(truth - truth.mean(0)).sum(1).mean())) if len(truth) else None
-        frames = len(Run(folder).scene().splits["train"])
         found = {
             "score": first_score(about),
             "baseline": still,
             "coverage": about["known"] / about["frames"],
-            "expected": frames,
+            "expected": about["frames"],
         }
         (folder / "cell.json").write_text(json.dumps(found | steps))
         return
@@ -470,10 +469,17 @@ def draw(method: str, cells: list[Cell], output: Path, results: dict[str, Result
         if not pictures[0].exists():
             pictures = [folder / "eval.png"] if (folder / "eval.png").exists() else []
         if pictures and cell.name in results:
-            shown = [torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255 for path in pictures]
-            lines.append(Line(f"{cell.setting}: {described(results[cell.name])}", shown))
+            shown = [enlarged(Image.open(path).convert("RGB")) for path in pictures]
+            lines.append(Line(f"{cell.setting}: {said(results[cell.name])}", shown))
     if lines:
         contact_sheet(method, ["photograph", "rendering"], lines).save(output / f"{method}.png")
+
+
+def enlarged(picture: Image.Image) -> torch.Tensor:
+    """Pixels of a small picture repeated, so that its label fits beside it."""
+    pixels = torch.from_numpy(np.array(picture)).float() / 255
+    times = max(1, SHEET_SIDE // max(pixels.shape[:2]))
+    return pixels.repeat_interleave(times, 0).repeat_interleave(times, 1)
 
 
 def publish(results: dict[str, Any]) -> None:

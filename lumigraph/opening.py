@@ -6,6 +6,7 @@ scenes have kinds of their own.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -103,8 +104,8 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
 
 def folder_of(path: Path) -> Path:
     """Folder of a capture for one of the files by which a reader recognises it; any other path unchanged."""
-    named = any(path.name in reader.EXPECTED_FILES for reader in READERS.values())
-    return path.parent if named and path.is_file() and not meshes.is_mesh(path) else path
+    names = (re.split(r"[\s,;()]+", reader.EXPECTED_FILES) for reader in READERS.values() if path.suffix)
+    return path.parent if path.is_file() and any(path.name in words for words in names) else path
 
 
 def sources_of(collection: str | Path) -> dict[str, str]:
@@ -172,6 +173,11 @@ def open_scene(
         capture = read_capture(source, reader)
     if unposed is not None:
         capture = without_poses(capture, typed(Unposed, unposed, str(source)) if isinstance(unposed, dict) else unposed)
+    if capture.poseless:
+        raise LumigraphError(
+            f"{source} has colours and depth without poses; find them from both: lumigraph track splat-slam "
+            f"{source}, or from the colours alone: lumigraph capture {source}"
+        )
     if part is not None:
         capture = part_of(capture, typed(CapturePart, part, str(source)) if isinstance(part, dict) else part)
     if depth_from is not None:

@@ -70,7 +70,7 @@ def test_a_correction_turns_a_joint_in_its_parent():
     torch.testing.assert_close(found, moves(BEND), atol=1e-5, rtol=0)
     turns[:, 1, 0] += 0.3  # a mean is another body at rest
     torch.testing.assert_close(motion.transforms(*motion.local(torch.tensor([1.0])))[0], found, atol=1e-5, rtol=0)
-    network = BoneMotion(frame(), BoneNumbers("network", pose_width=4, pose_depth=1))
+    network = BoneMotion(frame(), BoneNumbers("network"))
     torch.testing.assert_close(network.corrected(), network.quaternions, atol=1e-3, rtol=0)  # hardly any at first
 
 

@@ -39,7 +39,7 @@ HERE = Similarity.make(1.0)
 STILL = {"residual_masks": False, "refine_cameras": False}
 NETWORK = {
     "field": "network", "depth": 2, "skip_layer": 1, "coarse_samples": 8, "fine_samples": 8, "rays_per_step": 64,
-    "position_frequencies": 4, "direction_frequencies": 2, "bfloat16": False,
+    "position_frequencies": 4, "bfloat16": False,
 }  # fmt: skip
 
 

@@ -788,6 +788,7 @@ def test_damaged_colmap_models(part, text, tiny, tmp_path):
 def test_colmap_images_that_are_elsewhere(tiny, tmp_path):
     write_colmap(tmp_path, tiny)
     (tmp_path / "images").rename(tmp_path / "other")
+    tiny.write_images(tmp_path / "another")  # and nothing says which
     refuse(tmp_path, "none of the 10 photographs", "view_00.png")
 
 

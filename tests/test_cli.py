@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from budgets import budget
 
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.commands.common import next_free, scene_name
+from lumigraph.files.names import discard
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 18)
@@ -119,9 +121,13 @@ def test_photographs_may_move_but_not_change(trained, photographs, tmp_path, cap
 
 def test_names_of_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert next_free("runs/fox-nerf") == Path("runs/fox-nerf-1")
-    Path("runs/fox-nerf-1").mkdir(parents=True)
-    assert next_free("runs/fox-nerf") == Path("runs/fox-nerf-2")
+    with ThreadPoolExecutor(8) as pool:  # each process has a name of its own
+        found = list(pool.map(lambda _: next_free("runs/fox-nerf"), range(16)))
+    assert sorted(map(str, found)) == sorted(f"runs/fox-nerf-{n}" for n in range(1, 17))
+    (found[0] / "config.json").write_text("{}")
+    for folder in found[:2]:
+        discard(folder)
+    assert [folder.exists() for folder in found[:3]] == [True, False, True]
     assert [scene_name(x) for x in ("a/my fox/", "procedural:still-life")] == ["my-fox", "still-life"]
 
 

@@ -19,6 +19,7 @@ import torch
 from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace
 from budgets import budget
+from deep_files import write_png16
 from PIL import Image, ImageCms, PngImagePlugin
 
 import lumigraph
@@ -147,12 +148,15 @@ def test_pixels_become_square_and_frames_whole(tmp_path):
         assert one.tags.interlaced and len(list(one.frames())) == 12
 
 
+def mirrored(film: bytes, width: int) -> bytes:
+    """An MP4 file whose display matrix mirrors it."""
+    begin = film.index(b"tkhd") + 4 + 4 + 20 + 16
+    return film[:begin] + struct.pack(">9i", -65536, 0, 0, 0, 65536, 0, width << 16, 0, 1 << 30) + film[begin + 36 :]
+
+
 def test_a_mirrored_film_is_turned_back(tmp_path):
     path = film(tmp_path / "a.mp4", PLAIN)
-    data = bytearray(path.read_bytes())
-    begin = data.index(b"tkhd") + 4 + 4 + 20 + 16
-    data[begin : begin + 36] = struct.pack(">9i", -65536, 0, 0, 0, 65536, 0, SIZE[0] << 16, 0, 1 << 30)
-    path.write_bytes(data)
+    path.write_bytes(mirrored(path.read_bytes(), SIZE[0]))
     np.testing.assert_allclose(means(first_picture(path)), PATCHES[::-1], atol=3)
 
 
@@ -268,20 +272,18 @@ def test_profiles_in_other_places_count_too(tmp_path):
         np.testing.assert_allclose(means(read_image(tmp_path / name, True, SIZE)), PATCHES, atol=4, err_msg=name)
 
 
+def with_profile(png: bytes, profile: bytes) -> bytes:
+    """A PNG file with a profile, behind its header."""
+    body = b"iCCP" + b"made\0\0" + zlib.compress(profile)
+    return png[:33] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[33:]
+
+
 def test_sixteen_bits_keep_their_precision(tmp_path):
     ramp = np.linspace(0.2, 0.3, SIZE[0])
     values = np.repeat(np.repeat(ramp[None, :, None], SIZE[1], 0), 3, -1)
     deep = np.rint(values * 65535).astype(np.uint16)
-    image = av.VideoFrame.from_ndarray(deep, format="rgb48le")
-    with av.open(str(tmp_path / "plain.png"), "w", format="image2", options={"update": "1"}) as container:
-        stream = container.add_stream("png", rate=1)
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "rgb48be"
-        container.mux(stream.encode(image))
-        container.mux(stream.encode(None))
-    data = (tmp_path / "plain.png").read_bytes()
-    body = b"iCCP" + b"made\0\0" + zlib.compress(P3)
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
+    write_png16(tmp_path / "plain.png", deep)
+    (tmp_path / "a.png").write_bytes(with_profile((tmp_path / "plain.png").read_bytes(), P3))
     found = read_deep(tmp_path / "a.png", True)
     assert found.dtype == np.uint16 and len(np.unique(found)) > 150
     expected = srgb_from_linear(values**2.2)  # grey has the same primaries

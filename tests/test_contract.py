@@ -237,7 +237,8 @@ def test_an_unlike_scene_is_learnt_or_refused_in_a_sentence(name, device, tmp_pa
     data = tiny.stranger()
     try:
         run = begin(name, data, tmp_path / "run", device)
-        method = train(run, data, device, steps=UNLIKE_STEPS).eval()
+        fit(method := run.new_method(device), data, run, steps=UNLIKE_STEPS, show=False)
+        method.eval()
         sound(method.render(data.cameras[SHOWN]).cpu(), (tiny.SIZE, tiny.SIZE))
     except LumigraphError as refusal:
         assert len(str(refusal)) > 40

@@ -134,7 +134,7 @@ def test_a_partial_scan_finds_its_place_in_the_whole(learnt):
 
 
 def test_a_shape_is_drawn(learnt):
-    one, other = learnt.drawn(1), learnt.drawn(2)
+    one, other = learnt.draw_object(1), learnt.draw_object(2)
     assert not torch.equal(one.code, other.code) and one.control("instance") == FOUND
 
 

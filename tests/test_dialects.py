@@ -16,16 +16,17 @@ import torch
 from budgets import budget
 from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_nerfstudio, write_ngp
 from PIL import Image
+from PIL.JpegImagePlugin import JpegImageFile
 
 from lumigraph.camera.lens import Pinhole
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.exchange import is_moving, is_splat_file, read_gaussians, read_moving, write_gaussians
+from lumigraph.exchange import holds_points, is_moving, is_splat_file, read_gaussians, read_moving, write_gaussians
 from lumigraph.exchange.fourdgs import write_moving
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.large import open_any
 from lumigraph.opening import read_capture
-from lumigraph.readers import choose_reader, colmap, light_field, phones, transforms
+from lumigraph.readers import choose_reader, colmap, light_field, phones, pictures, transforms
 from lumigraph.readers.capture import checked_pose
 from lumigraph.readers.finding import find_named, paired
 from lumigraph.readers.meshes import read_mesh
@@ -181,6 +182,19 @@ def test_photographs_are_known_by_their_content(tmp_path, kind, suffix):
     assert found.suffix == suffix and read_image(found, True, (30, 20)).mean() == pytest.approx(90, abs=2)
 
 
+def test_a_large_jpeg_is_decoded_reduced(tmp_path, monkeypatch):
+    y, x = np.mgrid[:480, :640]
+    whole = np.stack([x / 3, y / 2, 99 + 0 * x], -1).astype(np.uint8)
+    Image.fromarray(whole).save(tmp_path / "a.jpg", quality=95)
+    before = read_image(tmp_path / "a.jpg", False, (64, 48)).astype(float)
+    drafts: list[tuple] = []
+    draft = JpegImageFile.draft
+    monkeypatch.setattr(JpegImageFile, "draft", lambda *given: drafts.append(draft(*given)))
+    monkeypatch.setattr(pictures, "LARGE", 100_000)
+    after = read_image(tmp_path / "a.jpg", False, (64, 48)).astype(float)
+    assert len(drafts) == 1 and np.abs(after - before).mean() < 1
+
+
 def test_depth_of_floats_keeps_its_numbers(tmp_path):
     values = np.linspace(0.5, 7, 12, dtype="<f4").reshape(3, 4)
     (tmp_path / "a.pfm").write_bytes(b"Pf\n4 3\n-1.0\n" + values[::-1].tobytes())
@@ -234,6 +248,71 @@ def test_frames_of_a_row_of_cameras_are_no_light_field(tiny, tmp_path):
     assert light_field.recognises(tmp_path) and "if it is none" in light_field.read(tmp_path).notes[0]
 
 
+# Meshes
+
+
+def write_gltf(path: Path, accessor: dict, numbers: bytes, **primitive: int) -> None:
+    """A mesh of four corners whose positions are the first accessor, with its buffer in a file with a blank."""
+    (path.parent / "my bin.bin").write_bytes(numbers)
+    views = accessor.pop("views")
+    about = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    about |= {"buffers": [{"uri": "my%20bin.bin", "byteLength": len(numbers)}], "accessors": [accessor]}
+    about["bufferViews"] = [{"buffer": 0, "byteOffset": at, "byteLength": size} for at, size in views]
+    about["meshes"] = [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5} | primitive]}]
+    path.write_text(json.dumps(about))
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FLOATS = CORNERS.astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("more", "numbers", "last"),
+    [
+        ({"componentType": 5126, "views": [(0, 48)]}, FLOATS, 1),
+        (
+            {"componentType": 5122, "normalized": True, "views": [(0, 24)]},
+            (32767 * CORNERS).astype("<i2").tobytes(),
+            1,
+        ),
+        (
+            {
+                "componentType": 5126,
+                "views": [(0, 48), (48, 2), (52, 12)],
+                "sparse": {
+                    "count": 1,
+                    "indices": {"bufferView": 1, "componentType": 5123},
+                    "values": {"bufferView": 2},
+                },
+            },
+            FLOATS + bytes([3, 0, 0, 0]) + np.array([0, 0, 9], "<f4").tobytes(),
+            9,
+        ),
+    ],
+)
+@pytest.mark.parametrize("mode", [5, 6])
+def test_gltf_of_other_programs(more, numbers, last, mode, tmp_path):
+    accessor = {"bufferView": 0, "count": 4, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 9]} | more
+    write_gltf(tmp_path / "a.gltf", accessor, numbers, mode=mode)
+    found = read_mesh(tmp_path / "a.gltf")
+    assert len(found.faces) == 2
+    np.testing.assert_allclose(found.vertices, CORNERS * [1, 1, last], atol=1e-4)
+    (tmp_path / "my bin.bin").unlink()
+    with pytest.raises(LumigraphError, match="my bin.bin, which does not exist"):
+        read_mesh(tmp_path / "a.gltf")
+
+
+@pytest.mark.parametrize(("form", "full"), [("ushort red", 65535), ("uchar diffuse_red", 255), ("float red", 1)])
+def test_colours_of_ply(form, full, tmp_path):
+    names = "".join(f"property {form.replace('red', colour)}\n" for colour in ("red", "green", "blue"))
+    place = "".join(f"property float {axis}\n" for axis in "xyz")
+    rows = f"0 0 0 {full} 0 0\n1 0 0 0 {full} 0\n0 1 1 0 0 0\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n"
+    (tmp_path / "a.ply").write_text(f"{head}{place}{names}end_header\n{rows}")
+    assert read_mesh(tmp_path / "a.ply").colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 0]]
+    assert holds_points(tmp_path / "a.ply")
+
+
 # Files of other programs
 
 
@@ -253,8 +332,7 @@ def test_files_of_other_programs_are_named_with_a_way_out(tmp_path, name, words)
     ("name", "text", "words"),
     [("cameras.xml", "<document/>", "Metashape"), ("bundle.out", "# Bundle file v0.3", "Bundler"),
      ("images/a.xmp", "xcr:Position", "RealityScan"), ("a.csv", "#name,x,y,alt", "RealityScan"),
-     ("cameras_sphere.npz", "", "NeuS"), ("reconstruction.json", "[]", "OpenSfM"),
-     ("a.csv", "price", "no camera poses")],
+     ("cameras_sphere.npz", "", "NeuS"), ("reconstruction.json", "[]", "OpenSfM"), ("a.csv", "price", "no camera")],
 )  # fmt: skip
 def test_poses_of_other_programs_are_named_with_a_way_out(tiny, tmp_path, name, text, words):
     tiny.write_images(tmp_path / "images")

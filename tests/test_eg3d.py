@@ -304,9 +304,9 @@ def test_seeds_interpolate_and_truncation_ends_at_the_average():
     style = {seed: method.given(seed=seed)._style() for seed in (3.0, 3.25, 4.0)}
     torch.testing.assert_close(style[3.25], torch.lerp(style[3.0], style[4.0], 0.25))
     torch.testing.assert_close(method.given(seed=3.0, truncation=0.0)._style(), method.averaged.average)
-    torch.testing.assert_close(render(method, seed=3.0), method.drawn(3).render(some_cameras(1)).rgb)
+    torch.testing.assert_close(render(method, seed=3.0), method.draw_object(3).render(some_cameras(1)).rgb)
     assert not torch.equal(render(method, seed=3.0), render(method, seed=4.0))
-    assert [control.name for control in method.drawn(3).controls] == ["truncation", "picture"]
+    assert [control.name for control in method.draw_object(3).controls] == ["truncation", "picture"]
 
 
 def test_the_volume_rendering_is_what_its_field_shows():

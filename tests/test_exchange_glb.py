@@ -241,7 +241,8 @@ def test_usd_keeps_an_offset_in_doubles(tmp_path):
     near = make(5, 0)
     offset = torch.tensor([512345.0, 4649776.0, 312.0], dtype=torch.float64)
     write_gaussians(
-        tmp_path / "a.usdc", replace(near, means=near.means.double() + offset, log_scales=near.log_scales - 3)
+        tmp_path / "a.usdc",
+        replace(near, means=(near.means.double() + offset).requires_grad_(), log_scales=near.log_scales - 3),
     )
     stage = pxr.Stage.Open(str(tmp_path / "a.usdc"))
     cache = UsdGeom.XformCache()

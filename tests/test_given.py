@@ -46,7 +46,6 @@ SMALL = changed(
     base_resolution=4,
     max_resolution=24,
     hidden_width=16,
-    geometry_features=8,
     sh_bands=2,
     samples_per_step=2048,
     steps_per_diagonal=96,

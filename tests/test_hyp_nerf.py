@@ -22,7 +22,7 @@ from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
 from lumigraph.method.controls import AVERAGE
 from lumigraph.methods import find
-from lumigraph.methods.hyp_nerf import HypNeRF, around, held, patch
+from lumigraph.methods.hyp_nerf import HypNeRF, around, in_cells, patch
 from lumigraph.methods.hyp_nerf.networks import HashInstance, HashShape, HyperNetwork
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
@@ -116,7 +116,7 @@ def test_the_gaussian_fits_the_codes():
     assert codes.names == tuple(map(str, range(30))) and torch.equal(codes.code_of(AVERAGE), known.mean(0))
     torch.testing.assert_close(codes.axes.T @ codes.axes, known.T.cov())
     torch.testing.assert_close(codes.average + codes.along(known[4]) @ codes.axes, known[4])
-    drawn = torch.stack([codes.drawn(torch.Generator().manual_seed(seed)) for seed in range(400)])
+    drawn = torch.stack([codes.draw_code(torch.Generator().manual_seed(seed)) for seed in range(400)])
     torch.testing.assert_close(drawn.std(0), known.std(0), rtol=0.15, atol=0.01)
     torch.testing.assert_close(codes.code_of("3:7:0.25"), torch.lerp(known[3], known[7], 0.25))
 
@@ -138,7 +138,7 @@ def test_tuning_goes_with_what_was_found(learnt):
     whole, half, none = (told.given(instance=x)._told() for x in (FOUND, f"{FOUND}:1:0.5", "1"))
     change = whole.tensors[0] - made.tensors[0]
     assert change.abs().max() > 1e-3
-    (between,) = told._made(told.codes.code_of(f"{FOUND}:1:0.5", found=told.found.rows[0])[None])
+    (between,) = told._made(told.codes.code_of(f"{FOUND}:1:0.5", told.found.rows)[None])
     torch.testing.assert_close(half.tensors[0] - between.tensors[0], change / 2, atol=1e-5, rtol=1e-4)
     assert torch.equal(none.tensors[0], learnt.given(instance="1")._told().tensors[0])
     assert told.control("instance") == FOUND and learnt.control("instance") == AVERAGE
@@ -152,7 +152,9 @@ def test_no_density_is_learnt_where_photographs_see_through():
     lesson = method.batch(tiny_collection.collection(), torch.Generator().manual_seed(0))
     cells = lesson.evidence[0].cells
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]])
-    assert held(cells, inside).all() and not held(cells, torch.tensor([[0.9, 0.9, 0.9], [-1.0, 1.0, 1.0]])).any()
+    assert (
+        in_cells(cells, inside).all() and not in_cells(cells, torch.tensor([[0.9, 0.9, 0.9], [-1.0, 1.0, 1.0]])).any()
+    )
     assert 0.02 < cells.share < 0.5
     method.codes.begin(torch.arange(1, 4), 0.1, torch.Generator())
     term = method.loss(lesson, 0)["empty"]

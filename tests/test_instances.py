@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -11,7 +12,8 @@ from balls import BLUE, RED, WHITE, Splatted, eye
 from budgets import budget
 
 from lumigraph.components.instances import edit_of
-from lumigraph.datasets.scene import Photograph
+from lumigraph.datasets.images import Layer, LayerSource
+from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians import joined
 from lumigraph.gaussians.splatting import splat, view_of
@@ -70,6 +72,26 @@ def test_masks_teach_each_gaussian_its_instance(learnt):
     weigher, ones = CloudWeigher(learnt.cloud.gaussians(), 0.01), torch.ones(33, 33, 1)
     seen = sum(weigher.sums(eye(place), ones)[:, 0] for place in EYES) > 0.05
     assert (labels == truth)[seen].float().mean() > 0.97 and (labels == truth).float().mean() > 0.9
+
+
+def test_a_photograph_without_labels_learns_from_one_that_has_some(monkeypatch):
+    """Its own unknown labels teach nothing; those of the only labelled photograph do, from its camera."""
+    method, scene = method_of(two_balls()), tiny.scene()
+    step = step_at(method, eye(EYES[0]))
+    step.rgb = step.picture.rgb
+    other = step_at(method, eye(EYES[2])).photograph
+    step.photograph.extra["labels"] = torch.full_like(other.extra["labels"], -1)
+    step.photograph = replace(step.photograph, alpha=None)
+    planes = [None] * len(scene.names)
+    planes[5] = LayerSource(lambda: np.zeros(0))
+    layer = Layer(scene.images, planes, np.dtype(np.uint8), 1, "index")
+    method.identities.layers(replace(scene, layers={"labels": layer}))
+    asked = []
+    monkeypatch.setattr(Scene, "photograph", lambda self, index, layers: asked.append(index) or other)
+    method.identities.regularize(step)
+    assert asked == [5] and method.identities.seen.all() and step.terms["identity"] > 0
+    step.terms["identity"].backward()
+    assert method.identities.codes.grad.abs().sum() > 0 and method.cloud.means.grad is None
 
 
 def test_identities_change_nothing_else():

@@ -15,6 +15,7 @@ from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation import held_out_poses
 from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
+from lumigraph.methods import instant_ngp
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.run import Run, build
 from lumigraph.training import fit
@@ -28,7 +29,6 @@ SMALL = changed(
     base_resolution=4,
     max_resolution=32,
     hidden_width=16,
-    geometry_features=8,
     sh_bands=2,
     samples_per_step=2048,
     steps_per_diagonal=128,
@@ -122,12 +122,13 @@ def test_resuming_equals_never_having_stopped_to_the_bit(options, tmp_path):
     assert all(torch.equal(value, restored[name]) for name, value in expected.items())
 
 
-def test_exposure_finds_the_dark_photographs():
+def test_exposure_finds_the_dark_photographs(monkeypatch):
+    monkeypatch.setattr(instant_ngp, "DECAY_START", 0.9)
     scene = black_room()
     dark = scene.splits["train"][::2]
     pictures = [tiny.picture(pose)[..., :3] // (4 if i in dark else 1) for i, pose in enumerate(scene.cameras.pose)]
     scene = replace(scene, images=ImageStore.from_arrays(pictures))
-    made = method(scene, exposure_correction="yes", decay_start=0.9)
+    made = method(scene, exposure_correction="yes")
     train(made, scene, 120)
     gain = made.exposure.log_gain.detach()
     bright = scene.splits["train"][1::2]

@@ -17,7 +17,7 @@ from lumigraph.training import fit
 STEPS, SHARE = 40, 6  # steps, and how many of the first and of the last are compared
 TINY = {
     "field": "network", "depth": 3, "skip_layer": 2, "hidden_width": 32, "hidden_layers": 3,
-    "position_frequencies": 4, "direction_frequencies": 2, "coarse_samples": 12, "fine_samples": 12,
+    "position_frequencies": 4, "coarse_samples": 12, "fine_samples": 12,
     "rays_per_step": 128, "learning_rate": 5e-3, "final_learning_rate": 1e-3, "bfloat16": False,
     "teacher_share": 1.0, "deferred_share": 0.99, "frequency_deviation": 4.0,
 }  # fmt: skip

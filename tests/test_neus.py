@@ -13,7 +13,7 @@ from budgets import budget
 from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.hash_field import TINY_TABLE
 from lumigraph.datasets.scene import Frame
-from lumigraph.methods.neus import Config, HashDistance, NeuS, eikonal, first_sphere, mask_error
+from lumigraph.methods.neus import Config, DistanceNumbers, HashDistance, NeuS, eikonal, first_sphere, mask_error
 from lumigraph.methods.neus.fields import NetworkDistance, NeuSField
 from lumigraph.methods.neus.sampler import in_order, section_weights
 from lumigraph.volume import weights_of
@@ -21,7 +21,7 @@ from lumigraph.volume import weights_of
 pytestmark = budget("methods", 8)
 
 UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-PAPER = replace(Config(), hidden_width=48)
+PAPER = replace(Config(), network=DistanceNumbers(depth=3, position_frequencies=3), hidden_width=48)
 SHARPNESS, WALL = 64.0, 1.0  # s per scene unit; distance along the ray at which a plane is met
 
 
@@ -92,7 +92,7 @@ def test_the_distance_begins_as_that_of_a_sphere(hollow):
     truth = ((points - centre).norm(dim=-1) - radius) * (-1 if hollow else 1)
     table = HashDistance(TINY_TABLE, 16, None)
     torch.manual_seed(0)
-    network = NetworkDistance(256, 8, 6)
+    network = NetworkDistance(DistanceNumbers(), 256)
     for shape, tolerance, deviation in ((table, 1e-3, 1e-2), (network, 0.16, 0.12)):
         shape.begin_as(centre, radius, hollow)
         with torch.no_grad():
@@ -124,7 +124,7 @@ def test_levels_that_join_make_taps_closer():
 
 def test_the_gradient_of_the_network_is_that_of_its_distance():
     torch.manual_seed(0)
-    shape, points, step = NetworkDistance(48, 3, 3).double(), points_in_box(20).double(), 1e-5
+    shape, points, step = NetworkDistance(PAPER.network, 48).double(), points_in_box(20).double(), 1e-5
     found = shape.surface(points).gradient
     for axis, way in enumerate(step * torch.eye(3, dtype=torch.float64)):
         slope = (shape.distance(points + way) - shape.distance(points - way)) / (2 * step)

@@ -88,7 +88,7 @@ def test_photographs_without_labels_are_refused():
     bare.images.has_alpha = False
     try:
         with pytest.raises(LumigraphError, match="folder `labels` beside them"):
-            new().begin(bare)
+            new().check_data(bare)
     finally:
         bare.images.has_alpha = True
 
@@ -133,6 +133,10 @@ def test_pixels_beside_a_mask_are_asked_about_it_and_few_others():
     disc = (np.hypot(x - 6, y - 6) < 4).astype(np.uint8)
     about = Layer(scene.images, [LayerSource(lambda: disc)] * len(scene.names), np.dtype(np.uint8), 1, "index")
     labelled = with_beside(replace(scene, layers={"labels": about}))
+    assert len(labelled.splits["train"]) == len(scene.splits["train"]) == 9
+    few = replace(about, planes=[plane if i in (1, 2) else None for i, plane in enumerate(about.planes)])
+    often = with_beside(replace(scene, layers={"labels": few})).splits["train"].tolist()
+    assert [often.count(i) for i in (1, 2, 3)] == [4, 4, 1]
     found = labelled.layer("beside").stored(0)
     away = np.hypot(x - 6, y - 6)
     assert found[(away > 4) & (away < 5)].mean() > 0.2 and not found[away > 10].any()

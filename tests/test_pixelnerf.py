@@ -137,8 +137,9 @@ def test_the_network_is_the_papers():
     torch.testing.assert_close(found, F.linear(x.relu(), network.last.weight, network.last.bias), atol=1e-5, rtol=1e-4)
 
 
-def test_the_order_of_views_does_not_matter_and_twice_the_same_is_once():
-    method, scene = pixelnerf(bfloat16=False), tiny.scene()
+def test_the_order_of_views_does_not_matter_and_twice_the_same_is_once(monkeypatch):
+    monkeypatch.setattr("lumigraph.methods.pixelnerf.BFLOAT16", False)
+    method, scene = pixelnerf(), tiny.scene()
     points, directions = torch.rand(40, 3) - 0.5, F.normalize(torch.randn(40, 3), dim=-1)
 
     def told(*images):
@@ -151,10 +152,11 @@ def test_the_order_of_views_does_not_matter_and_twice_the_same_is_once():
 
 
 @pytest.mark.parametrize("centred", [True, False])
-def test_a_scene_that_is_turned_whole_looks_the_same(centred):
+def test_a_scene_that_is_turned_whole_looks_the_same(centred, monkeypatch):
     """All that the network is told is relative to the cameras; seen from the camera, moving the scene changes nothing
     either."""
-    method, scene = pixelnerf(bfloat16=False, centred=centred), tiny.scene()
+    monkeypatch.setattr("lumigraph.methods.pixelnerf.BFLOAT16", False)
+    method, scene = pixelnerf(centred=centred), tiny.scene()
     turn = torch.eye(4)
     turn[:3, :3] = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
     turn[:3, :3] *= torch.linalg.det(turn[:3, :3])

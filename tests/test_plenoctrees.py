@@ -212,7 +212,7 @@ def test_nothing_to_bake_is_said():
 
 
 def test_the_papers_network_learns_too_and_is_baked():
-    made = method(field="network", depth=3, hidden_width=16, position_frequencies=4, learning_rate=5e-3)
+    made = method(field="network", hidden_width=16, learning_rate=5e-3)
     scene, chance = tiny.scene(), torch.Generator().manual_seed(0)
     made.begin(scene)
     made.progress = 0.0

@@ -99,7 +99,7 @@ ABSURD = [
     ("instant-ngp", "max_resolution", -1, "1 to 1,048,576"),
     ("instant-ngp", "steps_per_diagonal", -1, "4 to 16,384"),
     ("instant-ngp", "levels", 1_000_000, "1 to 32"),
-    ("instant-ngp", "colour_layers", 1_000_000, "1 to 64"),
+    ("imap", "colour_layers", 1_000_000, "1 to 64"),
     ("instant-ngp", "learning_rate", math.nan, "0 to 10"),
     ("nerf", "depth", 1_000_000, "2 to 64"),
     ("nerf", "warmup", math.inf, "0 to 1"),

@@ -220,7 +220,7 @@ def test_it_goes_through_its_stages_by_the_share_of_the_budget():
 
 def test_the_papers_network_is_baked_as_well():
     """And its layers are let go of, all of them."""
-    config = changed(SNeRG.smallest(), field="network", hidden_layers=3, position_frequencies=4, learning_rate=5e-3)
+    config = changed(SNeRG.smallest(), field="network", hidden_layers=3, learning_rate=5e-3)
     method = SNeRG(tiny.scene().frame, config)
     fit(method, tiny.scene(), steps=8, show=False, rehearsal=False)
     assert method.stage == ATLAS and not sum(x.numel() for x in method.network.parameters())

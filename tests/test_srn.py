@@ -131,8 +131,8 @@ def test_the_code_of_an_unseen_scene_explains_its_photographs(taught):
         return float((shown - picture.before(unseen.frame.background)).square().mean())
 
     assert error(told) < min(error(taught.given(instance=name)) for name in ("average", *taught.codes.names))
-    drawn = taught.drawn(1)
-    assert not torch.equal(drawn.code, told.code) and torch.equal(taught.drawn(1).code, drawn.code)
+    drawn = taught.draw_object(1)
+    assert not torch.equal(drawn.code, told.code) and torch.equal(taught.draw_object(1).code, drawn.code)
 
 
 def test_more_members_than_codes_are_refused():

@@ -44,12 +44,6 @@ def test_disparity_of_a_square_before_a_wall():
     assert ((found.values - truth).abs() < 0.5)[22:38, 40 - (NEAR - FAR) : 40].float().mean() > 0.9
 
 
-def test_blocks_from_coarse_to_fine_find_the_square():
-    left, right, truth = square_before_a_wall()
-    found = stereo.by_blocks(left, right, 0, 16)
-    assert ((found - truth).abs() < 0.5)[:, FAR:].float().mean() > 0.85
-
-
 def test_a_wall_without_texture_is_not_sure():
     flat = torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8)
     assert not stereo.semi_global(flat, flat, 0, 16).sure.any()

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from budgets import budget
 
+from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.components.tracking.alignment import aligned
+from lumigraph.components.tracking.frames import DepthFrame, Moment
 from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
+from lumigraph.components.tracking.tracker import Tracker, TrackingNumbers
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, apply_twists, relative, rigid
 from lumigraph.components.training.shared_points import Seen
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
+from lumigraph.evaluation.tracking import Tracked
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
 from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.readers.unposed import Unposed
@@ -177,6 +185,98 @@ def test_a_loop_spreads_the_drift():
     loops.motions = torch.cat([loops.motions, torch.eye(3, 4)[None]])
     wrong = loops.closed(images, poses)
     assert float((wrong[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) < 0.6 * before
+
+
+ROOM = 1.5  # metres from its middle to its walls
+
+
+def in_room(index: int, pose: torch.Tensor, blank: bool = False) -> DepthFrame:
+    """A frame inside a cube whose walls have squares of random grey."""
+    camera = Camera(torch.eye(3, 4)[None], Pinhole(torch.tensor([[150.0, 150.0]]), torch.tensor([[80.0, 60.0]])), SIZE)
+    rays = camera.rays(camera.pixels())
+    towards = rays.directions @ pose[:, :3].T
+    depth = ((ROOM * towards.sign() - pose[:, 3]) / towards).amin(-1)
+    cell = ((pose[:, 3] + depth[:, None] * towards) / 0.13 + 0.01).floor()
+    grey = (torch.sin(cell @ torch.tensor([12.9898, 78.233, 37.719])) * 43758.5).frac().abs() * (not blank)
+    return DepthFrame(index, camera, rays, grey[:, None].repeat(1, 3), depth, None, (160, 120))
+
+
+SIZE = torch.tensor([[160, 120]])
+
+
+def steps(count: int, motion: tuple[float, ...]) -> list[torch.Tensor]:
+    pose = rigid(apply_twists(torch.eye(3, 4)[None], torch.tensor([[0.2, 0.5, 0.1, 0, 0, 0]])))
+    poses = [pose[0]]
+    for _ in range(count - 1):
+        pose = rigid(apply_twists(pose, torch.tensor([motion])))
+        poses.append(pose[0])
+    return poses
+
+
+def tracker_of(frames: list[DepthFrame], first: torch.Tensor) -> tuple[Tracker, Scene]:
+    """A tracker with these frames in memory, and the scene that knows the first pose alone."""
+    tracker = Tracker(len(frames), TrackingNumbers(track=True), 1.0)
+    tracker._held = {frame.index: frame for frame in frames}
+    return tracker, Mock(spec=Scene, cameras=SimpleNamespace(pose=first.repeat(len(frames), 1, 1)))
+
+
+def test_a_pose_is_checked_by_the_depth_of_keyframes():
+    first, second, aside = *steps(2, (0.03, 0.05, 0, 0.05, 0, 0.04)), steps(2, (0, 2.0, 0, 0, 0, 0))[1]
+    frames = [in_room(0, first), in_room(1, second), in_room(2, aside), in_room(3, second)]
+    frames[1].depth[::3] = torch.nan
+    tracker, scene = tracker_of(frames, first)
+    tracker.trajectory.know(0, first, 0)
+    tracker.add_keyframe(frames[0])
+    assert tracker.agrees(frames[1], second, scene, 0) and tracker.overlap > 0.7
+    wrong = torch.cat([second[:, :3], second[:, 3:] + 0.15], 1)
+    assert not tracker.agrees(frames[1], wrong, scene, 0)
+    assert tracker.agrees(frames[2], aside, scene, 0) and tracker.overlap < 0.3  # nothing in common is no fault
+    tracker.trajectory.know(1, wrong, 0)  # a drift that the last frame shares
+    assert not tracker.agrees(replace(frames[1], index=3), wrong, scene, 1)
+
+
+def test_features_find_a_fast_camera_that_the_map_does_not():
+    """10 cm and 5 degrees a frame, and a map that accepts and spoils all poses: each frame is found to 2 cm. A frame
+    without features is lost and has no pose; the next one is found again."""
+    poses = steps(5, (0.05, 0.06, 0.02, 0.08, 0.02, -0.05))
+    frames = [in_room(i, pose, blank=i == 2) for i, pose in enumerate(poses)]
+    tracker, scene = tracker_of(frames, poses[0])
+    off = torch.cat([torch.zeros(3, 3), torch.full((3, 1), 0.4)], 1)
+    for i, frame in enumerate(frames):
+        moment = Moment(scene, frame, list(range(i)))
+        share = tracker.follow(frame, moment, lambda seen, pose: pose + off, lambda seen, pose: 1.0)
+        tracker.add_keyframe(frame) if i == 0 else None
+        assert (share is None) == (i == 2)
+    apart = (tracker.trajectory.poses[:, :, 3] - torch.stack(poses)[:, :, 3]).norm(dim=-1)
+    assert float(apart[[0, 1, 3, 4]].max()) < 0.02 and tracker.trajectory.state[2] == LOST
+
+
+@pytest.mark.parametrize("metres", [0.01, 0.07])
+def test_fast_motion_is_said_once(metres):
+    poses = steps(12, (0.0, 0.0, 0.0, metres, 0.0, 0.0))
+    tracker, _ = tracker_of([], poses[0])
+    tracker.trajectory = Trajectory(12)
+    for i, pose in enumerate(poses):
+        tracker.trajectory.know(i, pose, 0)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for count in range(1, 12):
+            tracker.warn_of_speed(list(range(count)))
+    assert [str(x.message)[:38] for x in said] == ["The camera moves by 7 cm and 0 degrees"] * (metres > 0.05)
+
+
+def test_a_path_is_drawn_to_one_scale_with_its_loops():
+    circle = torch.arange(20) * (2 * math.pi / 20)
+    poses = np.concatenate(
+        [np.eye(3)[None].repeat(20, 0), np.stack([circle.cos(), circle * 0, circle.sin()], -1)[:, :, None]], -1
+    )
+    drawn = Tracked(list(range(20)), [], list(range(20)), poses, poses, [(0, 19), (3, 12)]).map
+    assert drawn.count("<path class='bold") == 4 and drawn.count(">loops<") == 1
+    places = np.array(
+        [[float(x) for x in pair.split()] for pair in drawn.split("bold c0' d='M")[1].split("'")[0].split("L")]
+    )
+    across, down = np.ptp(places, axis=0)
+    assert across == pytest.approx(down, rel=0.02)
 
 
 def recording(depth: np.ndarray | None) -> Capture:

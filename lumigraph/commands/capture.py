@@ -36,15 +36,22 @@ class CaptureCommand(MotionOptions, Output):
     before a background at rest. Writes object_masks/ and object.png into the scene; check that picture."""
 
     def run(self) -> int:
-        from ..sfm.rig import capture_rig, is_rig
+        from ..sfm.rig import capture_recorded, capture_rig, is_recorded, is_rig
         from ..system.progress import track
 
         if not self.what:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
         folder = self.output or scene_folder(self.what)
-        if self.moving and len(self.what) == 1 and is_rig(self.what[0].expanduser()):
-            rows, said = capture_rig(self.what[0].expanduser(), folder, self, track)
-            show(rows | {"scene": str(folder), "next": typed("train", "deformable-splatting", folder)})
+        first, only = self.what[0].expanduser(), len(self.what) == 1
+        if only and ((recorded := is_recorded(first)) or (self.moving and is_rig(first))):
+            made = (
+                capture_recorded(first, folder, self.frames, track)
+                if recorded
+                else capture_rig(first, folder, self, track)
+            )
+            rows, said = made
+            method = "gaussian-splatting" if recorded else "deformable-splatting"
+            show(rows | {"scene": str(folder), "next": typed("train", method, folder)})
             for sentence in said:
                 say(f"warning: {sentence}")
             return 0

@@ -89,7 +89,7 @@ def with_range(kind: Any, name: str = "") -> Any:
     return Annotated[kind, arg(help_behavior_hint=hint)]
 
 
-def held(command: Any) -> Any:
+def check_command(command: Any) -> Any:
     """Validate a parsed command. Raises LumigraphError for a number out of range, and for contradictory ones."""
     for name, kind, value in outside(command):
         called = option_name(name, kind).replace("_", "-")
@@ -215,4 +215,4 @@ def parse(arguments: list[str]) -> Any:
         kinds.append(Annotated[kind, about])
     union: Any = functools.reduce(operator.or_, kinds)
     arguments = ["--help" if x == HELP_ALL else x for x in arguments or ["--help"]]
-    return held(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))
+    return check_command(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))

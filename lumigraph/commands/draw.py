@@ -92,7 +92,7 @@ class Draw:
         around = turned(camera, self.views)
         rows = []
         for seed in track(seeds, "Drawing", len(seeds)):
-            told: Any = drawing.drawn(seed)
+            told: Any = drawing.draw_object(seed)
             rows.append(Row(f"seed {seed}", [magnified(told.render(around[i]).rgb) for i in range(self.views)]))
         columns = [f"{360 * i // self.views}°" for i in range(self.views)]
         save_picture(sheet, contact_sheet(f"{run.title}: {len(seeds)} drawn objects", columns, rows), "drawings")
@@ -120,7 +120,7 @@ class Draw:
         if any(control.name == "seed" for control in method.controls):
             shown = animated(method, {"seed": [float(seed) for seed in seeds]}, count)
         else:
-            drawn = [method.drawn(seed) for seed in seeds]
+            drawn = [method.draw_object(seed) for seed in seeds]
             shown = [drawn[i // self.frames] for i in range(count)]
         assert self.film is not None
         cameras = turned(camera, count, max(1, len(seeds) // 4))

@@ -49,6 +49,8 @@ class Eval(Reports, EvaluationOptions):
             rows["detail"] = str(FineDetail(**result["detail"]))
         for name, part in (result.get("by_resolution", {}) | result.get("by_held_out", {})).items():
             rows[name] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
+        if trivial := result.get("baselines"):
+            rows["without training"] = ", ".join(f"{name} {value:.2f}" for name, value in trivial.items())
         name = run.folder / stem(self.split)
         rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
         learnt = last_psnr(run.metrics())

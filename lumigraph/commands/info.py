@@ -27,7 +27,7 @@ class Info:
 
     def run(self) -> int:
         from ..datasets.scene import Scene
-        from ..exchange import is_moving, is_splat_file, read_gaussians, read_moving, snerg
+        from ..exchange import holds_points, is_moving, is_splat_file, read_gaussians, read_moving, snerg
         from ..large import BlockRun
         from ..opening import folder_of, open_dataset, read_capture
         from ..run import is_block_run
@@ -42,7 +42,7 @@ class Info:
             tree = info_tree.run_tree(Run(self.what))
         elif is_moving(self.what):
             tree = info_tree.moving_tree(self.what, read_moving(self.what))
-        elif is_splat_file(self.what):
+        elif is_splat_file(self.what) and not holds_points(self.what):
             tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and folder_of(Path(self.what)).is_file():
             from ..large import open_any

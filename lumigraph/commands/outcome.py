@@ -70,7 +70,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
         beside = "" if method.complete else f", training photographs {psnr:.1f} dB"  # it shows these themselves
         rows["held-out photographs"] = f"{other:.1f} dB{beside} ({ABOUT_RESIDUALS})"
         gap = psnr - other
-        warn_below(run, checked.of("test"))
+        warn_below(run, method, checked.of("test"))
     if not method.complete:
         rows["advice"] = advice(trend, enough, more, photographed(run, data))
     if enough and not method.complete and gap > MEMORISED_DB:
@@ -124,7 +124,7 @@ def examined(run: Any, method: Method, data: Any, turn: Any) -> Examined:
         return Examined()
 
 
-def warn_below(run: Any, held_out: Sequence[Residual]) -> None:
+def warn_below(run: Any, method: Method, held_out: Sequence[Residual]) -> None:
     """Warn where renderings of held-out photographs are worse than trivial stand-ins."""
     from ..evaluation.baseline import below
 

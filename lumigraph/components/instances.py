@@ -28,7 +28,6 @@ AXES = "x", "y", "z"
 CONTROLS = {"edit", "turn", *(f"shift_{axis}" for axis in AXES)}
 SHIFT, TURN = (f"{change} of what is moved or copied" for change in ("Shift", "Rotation"))
 NOT_AN_INSTANCE = -1  # label of pixels that show no object, or an unknown one
-MAX_LABEL = 255  # the largest label that names an instance
 OPAQUE_ALPHA = 0.5
 
 
@@ -120,7 +119,8 @@ def warn_of_few_views(scene: Scene) -> None:
 
 def with_beside(scene: Scene) -> Scene:
     """The scene with a layer of the label at a random place near each pixel. A pixel beside a mask thus meets that mask
-    as often as the mask's pixels meet it: the closer and the larger, the more often. Without labels, the scene."""
+    as often as the mask's pixels meet it: the closer and the larger, the more often. Labelled photographs are repeated
+    in the training split, where they are few, to make up about half of it. Without labels, the scene."""
     if LABELS not in scene.layers:
         return scene
     layer = scene.layers[LABELS]
@@ -134,7 +134,11 @@ def with_beside(scene: Scene) -> Scene:
         return stored[row, column]
 
     planes = [plane and LayerSource(partial(beside, image)) for image, plane in enumerate(layer.planes)]
-    return replace(scene, layers=scene.layers | {BESIDE: layer.like(scene.images, planes)})
+    train = scene.splits["train"]
+    labelled = train[[layer.planes[i] is not None for i in train.tolist()]]
+    repeated = labelled.repeat(max(len(train) // max(len(labelled), 1) - 1, 0))
+    splits = scene.splits | {"train": torch.cat([train, repeated])}
+    return replace(scene, splits=splits, layers=scene.layers | {BESIDE: layer.like(scene.images, planes)})
 
 
 def labels_of(

@@ -84,12 +84,9 @@ class Composed(Method):
                     found.setdefault(control.name, control)
         return tuple(found.values())
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same composition with each part's values of controls."""
-        told = super().given(*evidence, **controls)
-        assert isinstance(told, Composed)
-        told.pieces = tuple(part.with_controls(controls) for part in self.pieces)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Give each part its values of controls."""
+        self.pieces = tuple(part.with_controls(controls) for part in self.pieces)
 
     def refined(self, cameras: Camera) -> Camera:
         """Cameras refined by the leading part."""

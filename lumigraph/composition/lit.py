@@ -206,11 +206,8 @@ class LitComposition(Composed):
         self.meshes = tuple(part for part in parts if isinstance(part.method, LitMesh))
         self.around = compose(frame, [part for part in parts if not isinstance(part.method, LitMesh)])
 
-    def given(self, *evidence: Any, **controls: Any) -> Method:
-        told = super().given(*evidence, **controls)
-        assert isinstance(told, LitComposition)
-        told.around = self.around.given(**controls)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Any]) -> None:
+        self.around = self.around.given(**controls)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

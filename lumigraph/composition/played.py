@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -63,11 +64,8 @@ class FilteredCloud(Method):
     def controls(self) -> tuple[Control, ...]:
         return self.method.controls
 
-    def given(self, *evidence: Any, **controls: Any) -> Method:
-        told = super().given(*evidence, **controls)
-        assert isinstance(told, FilteredCloud)
-        told.method = self.method.given(*evidence, **controls)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Any]) -> None:
+        self.method = self.method.given(**controls)
 
     def gaussians(self) -> Gaussians:
         return self.method.gaussians()[self.kept]

@@ -331,8 +331,8 @@ class Scene:
     def layer(self, name: str) -> Layer:
         """Layer by name. Raises LumigraphError, naming the existing ones, if there is none."""
         if name not in self.layers:
-            there = f"only {', '.join(self.layers)}" if self.layers else "nothing else"
-            raise LumigraphError(f"{self.source} has no {name} beside its photographs, {there}; add it, or do without")
+            there = f", only {', '.join(self.layers)}" if self.layers else ""
+            raise LumigraphError(f"{self.source} has no {name} beside its photographs{there}; add it, or do without")
         return self.layers[name]
 
     def sample_rays(

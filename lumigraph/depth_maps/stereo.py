@@ -1,4 +1,4 @@
-"""Stereo: disparity of a rectified pair, by semi-global matching or by coarse-to-fine block matching.
+"""Stereo: disparity of a rectified pair, by semi-global matching.
 
 A point at the left pixel (x, y) is at (x - d, y) on the right. With the baseline b, the focal length f and the offset
 d0 between the columns of both principal points, its distance along the axis is z = b f / (d + d0).
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, normalize, pad
+from torch.nn.functional import max_pool2d, normalize
 
 from .. import kernels
 from ..camera import Camera
@@ -35,8 +35,6 @@ FILL_DIRECTIONS = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1
 FILL_DIRECTIONS = np.concatenate([FILL_DIRECTIONS, -FILL_DIRECTIONS])
 FILL_PER_DIRECTION, FILL_REACH = 2, 100  # known pixels, and steps up to which they are looked for
 FILL_COLOUR, FILL_DISTANCE = 60.0, 30.0  # levels, summed over channels, and steps: a weight falls to 1 / e
-BLOCKS = (32, 16, 8, 4)  # pixels a side, coarse to fine; then each pixel with a window
-WINDOW = 5  # pixels a side of a single pixel's window
 MAX_DISPARITIES = 512
 MIN_ACROSS = math.cos(math.radians(60.0))  # sine of the angle between gaze and baseline, at least
 MIN_OVERLAP = 0.1  # share of the left picture's rows and columns that both pictures must show
@@ -182,46 +180,6 @@ def filled(
     given = found.numpy(), its.numpy(), state.numpy(), rgb.contiguous().numpy(), FILL_DIRECTIONS
     loops.fill_disparity(*given, FILL_PER_DIRECTION, FILL_REACH, FILL_COLOUR, FILL_DISTANCE, out.numpy())
     return out
-
-
-def by_blocks(
-    left: UInt8[Tensor, "height width 3"], right: UInt8[Tensor, "height width 3"], first: int, count: int
-) -> Float[Tensor, "height width"]:
-    """Coarse-to-fine block matching: large blocks search all disparities, smaller ones near those of their parent
-    blocks and neighbours, finally each pixel with its window. The cost is the mean absolute difference of colour."""
-    a, b = (x.float().mean(-1) for x in (left, right))
-    height, width = a.shape
-    side = BLOCKS[0]
-    rows, columns = math.ceil(height / side) * side, math.ceil(width / side) * side
-    a, b = (pad(x[None, None], (0, columns - width, 0, rows - height), "replicate")[0, 0] for x in (a, b))
-    x = torch.arange(columns)
-
-    def cost(disparity: Tensor, block: int) -> Tensor:
-        there = (x - disparity.repeat_interleave(block, 0).repeat_interleave(block, 1)).clamp(0, columns - 1)
-        difference = (a - b.gather(1, there)).abs()[None, None]
-        return avg_pool2d(difference, block)[0, 0]
-
-    candidates = [torch.full((rows // side, columns // side), d) for d in range(first, first + count)]
-    for block in BLOCKS:
-        costs = torch.stack([cost(one, block) for one in candidates])
-        best = torch.stack(candidates).gather(0, costs.argmin(0)[None])[0]
-        finer = best.repeat_interleave(2, 0).repeat_interleave(2, 1)
-        around = [finer, *(finer.roll(shift, axis) for shift in (-2, 2) for axis in (0, 1))]
-        candidates = [(one + step).clamp(first, first + count - 1) for one in around for step in (-1, 0, 1)]
-    best = best.repeat_interleave(block, 0).repeat_interleave(block, 1)
-    around = [best, *(best.roll(shift, axis) for shift in (-block, block) for axis in (0, 1))]
-    least = torch.full((rows, columns), torch.inf)
-    reach = range(-(WINDOW // 2), WINDOW // 2 + 1)
-    for one in (near + step for near in around for step in (-1, 0, 1)):
-        there = x - one.clamp(first, first + count - 1)
-        total = torch.zeros_like(a)
-        for dy in reach:
-            for dx in reach:
-                row = (torch.arange(rows) + dy).clamp(0, rows - 1)
-                column = (x + dx).clamp(0, columns - 1)
-                total += (a[row][:, column] - b[row].gather(1, (there + dx).clamp(0, columns - 1))).abs()
-        least, best = torch.minimum(least, total), torch.where(total < least, one, best)
-    return best[:height, :width].clamp(first, first + count - 1).float()
 
 
 def as_bytes(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "height width 3"]:

@@ -23,14 +23,18 @@ MAX_AVERAGED = 64  # training photographs in the mean picture
 Picture = Float[Tensor, "height width 3"]
 
 
-def below(place: object, name: str, score: float, baselines: Mapping[str, float]) -> str | None:
-    """Sentence for a score that is lower than the best trivial baseline; None for another one. name: with the unit"""
+def below(place: object, name: str, score: float, baselines: Mapping[str, float], complete: bool = False) -> str | None:
+    """Sentence for a score that is lower than the best trivial baseline; None for another one.
+
+    name: unit of the score; complete: whether longer training would change nothing
+    """
     best = max(baselines, key=lambda one: baselines[one], default=None)
     if best is None or score >= baselines[best]:
         return None
+    longer = "" if complete else "train for longer, or "
     return (
-        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; train "
-        "for longer, or compare another method on these data"
+        f"{place} has {score:.2f} {name}, and the {best} alone, which needs no training, {baselines[best]:.2f}; "
+        f"{longer}compare another method on these data"
     )
 
 

@@ -46,7 +46,7 @@ def drawn_pictures(method: Method, cameras: Camera, seed: int) -> Pictures:
         return needs(method, DrawsPictures).pictures(cameras, torch.Generator().manual_seed(seed)).clamp(0, 1)
     drawing: Any = needs(method, CanDraw)
     numbers = track(range(len(cameras)), "Drawing", len(cameras))
-    return torch.stack([drawing.drawn(seed + i).render(cameras[i]).rgb.cpu().clamp(0, 1) for i in numbers])
+    return torch.stack([drawing.draw_object(seed + i).render(cameras[i]).rgb.cpu().clamp(0, 1) for i in numbers])
 
 
 def drawing_scores(

@@ -138,7 +138,7 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
         maps.append(DepthMap.of_rendering(camera, seen, scene.frame.background))
         rgb = seen.rgb.clamp(0, 1)
         straight, mirrored = (fit(rgb[m], image[m]) for image, m in ((truth, mask), (truth.flip(1), mask.flip(1))))
-        trivial = {} if splits[index] == "train" else stand_ins.of(index, tuple(truth.shape[:2]))
+        trivial = {} if splits[index] == "train" else stand_ins.of(index, (truth.shape[0], truth.shape[1]))
         others = {name: fit(picture[mask], truth[mask]) for name, picture in trivial.items()}
         residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0, others)
         found.append(Compared(residual, index, side))

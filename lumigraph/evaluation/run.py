@@ -107,7 +107,8 @@ def evaluate_run(
         save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title), "evaluation")
     write_json(run.folder / f"{stem(split)}.json", result, "evaluation")
     for score in found.scores[:1]:
-        if sentence := below(run.folder, f"{score.unit or score.name}", score.value, result.get("baselines", {})):
+        unit, baselines = score.unit or score.name, result.get("baselines", {})
+        if sentence := below(run.folder, unit, score.value, baselines, method.complete):
             warnings.warn(sentence, LumigraphWarning, stacklevel=2)
     return result
 

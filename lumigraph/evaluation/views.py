@@ -273,7 +273,7 @@ def evaluate(
         score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
         if DEPTH_LAYER in shot.extra:
             score = replace(score, depth_error=depth_error(seen, shot.extra[DEPTH_LAYER]))
-        trivial = {} if stand_ins is None else stand_ins.of(index, tuple(photograph.shape[:2]))
+        trivial = {} if stand_ins is None else stand_ins.of(index, (photograph.shape[0], photograph.shape[1]))
         score = replace(score, held_out=kinds[index], baselines=trivial_scores(trivial, shot, photograph, columns))
         keep(score.name, seen)
         if index in spread:

@@ -108,7 +108,7 @@ def write_gaussians(
     sound = checked(gaussians, f"what is to be written to {path}", "remove them first")
     offset = None
     if sound.means.dtype == torch.float64 and ending != ".ply":
-        offset = sound.means.median(0).values.round()
+        offset = sound.means.detach().median(0).values.round()
         sound = replace(sound, means=(sound.means - offset).float())
     with counting(f"Writing {path.name}"):
         if path.name == streamed_sog.META:
@@ -168,6 +168,15 @@ def is_splat_file(path: Path | str) -> bool:
         with reading(path):
             return glb.recognises(path)
     return path.name.lower().endswith(SUFFIXES) and not moving_ply.has_motion(path)
+
+
+def holds_points(path: Path | str) -> bool:
+    """True for a .ply of points or triangles, which names no property of Gaussians."""
+    path = expanded(path)
+    if not (path.name.lower().endswith(".ply") and path.is_file()):
+        return False
+    here = {name for names in read_header(path).properties.values() for name in names}
+    return not here & {*ply.COLOUR, *ply.OPACITY, *ply.SCALE, *ply.ROTATION, "packed_position"}
 
 
 def names_splats(path: Path | str) -> bool:

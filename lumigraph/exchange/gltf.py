@@ -8,22 +8,28 @@ from __future__ import annotations
 
 import json
 import struct
+import warnings
+from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import unquote
 
 import msgspec
 import numpy as np
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import from_json
 from ..files.ranges import Coordinate, Tally, between, format_value, typed
+from ..files.reading import reading
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
 PACKINGS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")  # of vertices
+KTX2 = "KHR_texture_basisu"
 MAX_JSON_BYTES = 1 << 24
+FAN = 6  # a mode of triangles
 VERTICES, INDICES = 34962, 34963  # section 5.11.5: what a part of the buffer is for
 KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # 3.6.2.2
 NUMBERS = {np.dtype(kind): number for number, kind in KINDS.items()}
@@ -53,6 +59,22 @@ class Accessor(msgspec.Struct, rename="camel"):
     byte_offset: Tally = 0
     normalized: bool = False
     sparse: Any = None
+
+
+class SparsePart(msgspec.Struct, rename="camel"):
+    """Indices of changed rows, or their values (section 3.6.2.3)."""
+
+    buffer_view: Index
+    byte_offset: Tally = 0
+    component_type: int = 5126
+
+
+class Sparse(msgspec.Struct):
+    """Rows of an accessor that differ from its buffer view, or from zero."""
+
+    indices: SparsePart
+    values: SparsePart
+    count: Tally
 
 
 class Buffer(msgspec.Struct, rename="camel"):
@@ -228,8 +250,76 @@ def refuse_compressed(path: Path) -> None:
         text = head + file.read(min(length, MAX_JSON_BYTES))
     if found := [name for name in PACKINGS if f'"{name}"'.encode() in text]:
         raise LumigraphError(
-            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression"
+            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression, "
+            "for instance from Blender, which opens it"
         )
+    if f'"{KTX2}"'.encode() in text:
+        told = f"{path} has textures of KTX2, which are not read; colours are those of its materials"
+        warnings.warn(told, LumigraphWarning, 3)
+
+
+def plain(path: Path) -> bytes:
+    """A .glb or .gltf as one .glb whose positions are floats and whose faces are lists of triangles, for a reader that
+    knows neither sparse nor normalised numbers nor fans. Raises LumigraphError for a file that it leads to and is none.
+    """
+    data, binary, text = path.read_bytes(), b"", b""
+    if data[:4] == MAGIC:
+        size = CHUNK.unpack_from(data, HEADER.size)[0]
+        text, binary = data[HEADER.size + CHUNK.size :][:size], data[HEADER.size + 2 * CHUNK.size + size :]
+    about, whole, starts = from_json(text or data, path), bytearray(), []
+    for buffer in about.get("buffers", []):
+        starts.append(len(whole))
+        whole += binary if buffer.get("uri") is None else linked(path, buffer["uri"])
+        whole += bytes(-len(whole) % 4)
+    for view in about.get("bufferViews", []):
+        view["byteOffset"] = view.get("byteOffset", 0) + starts[view.get("buffer", 0)]
+        view["buffer"] = 0
+    for image in about.get("images", []):
+        image |= {"uri": unquote(image["uri"])} if not image.get("uri", "data:").startswith("data:") else {}
+    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
+    file, done = File(path, packed(about, bytes(whole))), set()
+    for primitive in (x for mesh in about.get("meshes", []) for x in mesh.get("primitives", [])):
+        place = primitive.get("attributes", {}).get("POSITION")
+        if place is None:
+            continue
+        accessor = file.accessor(place)
+        if place not in done and (accessor.sparse is not None or accessor.component_type != NUMBERS[np.dtype("<f4")]):
+            about["accessors"][place] = appended(about, whole, file.numbers(place, (3,)), "VEC3")
+            done.add(place)
+        if primitive.get("mode") == FAN:
+            count, own = accessor.count, primitive.get("indices")
+            order = np.arange(count) if own is None else file.numbers(own, (1,))[:, 0].astype(np.int64)
+            fan = np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], 1).astype("<u4").reshape(-1, 1)
+            primitive |= {"mode": 4, "indices": len(about["accessors"])}
+            about["accessors"].append(appended(about, whole, fan, "SCALAR"))
+    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
+    return packed(about, bytes(whole))
+
+
+def linked(path: Path, uri: str) -> bytes:
+    """Bytes of a buffer in the text itself, or in a file beside it."""
+    if uri.startswith("data:"):
+        return b64decode(uri.partition(",")[2])
+    file = path.parent / unquote(uri)
+    if not file.is_file():
+        raise LumigraphError(f"{path} keeps its numbers in {file}, which does not exist; copy it too, or export a .glb")
+    return file.read_bytes()
+
+
+def appended(about: dict[str, Any], whole: bytearray, values: np.ndarray, shape: str) -> dict[str, Any]:
+    """Accessor of values that are appended to the buffer."""
+    about["bufferViews"].append({"buffer": 0, "byteOffset": len(whole), "byteLength": values.nbytes})
+    whole += values.tobytes()
+    kind, view = NUMBERS[values.dtype], len(about["bufferViews"]) - 1
+    return {"bufferView": view, "componentType": kind, "count": len(values), "type": shape}
+
+
+def packed(about: dict[str, Any], buffer: bytes) -> bytes:
+    """Bytes of a .glb file."""
+    text = json.dumps(about).encode()
+    text, buffer = text + b" " * (-len(text) % 4), buffer + bytes(-len(buffer) % 4)
+    chunks = CHUNK.pack(len(text), JSON) + text + (CHUNK.pack(len(buffer), BINARY) + buffer if buffer else b"")
+    return HEADER.pack(MAGIC, 2, HEADER.size + len(chunks)) + chunks
 
 
 class File:
@@ -240,8 +330,8 @@ class File:
 
     about: About
 
-    def __init__(self, path: Path):
-        self.path, data = path, path.read_bytes()
+    def __init__(self, path: Path, data: bytes | None = None):
+        self.path, data = path, path.read_bytes() if data is None else data
         if len(data) < HEADER.size + CHUNK.size or data[:4] != MAGIC:
             raise LumigraphError(f"{path} is no .glb file, for it does not begin like one; name another one")
         _, version, size = HEADER.unpack_from(data)
@@ -280,28 +370,42 @@ class File:
         """
         accessor = self.accessor(index)
         kind, width = KINDS.get(accessor.component_type), SHAPES.get(accessor.type)
-        if kind is None or width not in widths or accessor.sparse is not None or accessor.buffer_view is None:
+        if kind is None or width not in widths or (accessor.sparse is None and accessor.buffer_view is None):
             raise LumigraphError(
                 f"{self.path}: accessor {index} is of a kind that is not read here ({format_value(accessor.type)} of "
-                f"type {accessor.component_type}, sparse or without numbers); export it without compression"
+                f"type {accessor.component_type}, or without numbers); export it without compression"
             )
-        view = self.one(self.about.buffer_views, accessor.buffer_view, "buffer view")
-        buffer = self.one(self.about.buffers, view.buffer, "buffer")
-        if view.buffer or buffer.uri is not None:
-            raise LumigraphError(f"{self.path} leads to other files for its numbers; export it as one .glb")
         dtype = np.dtype(kind)
-        stride = view.byte_stride or dtype.itemsize * width
-        end = accessor.byte_offset + (stride * (accessor.count - 1) + dtype.itemsize * width if accessor.count else 0)
-        if end > view.byte_length or view.byte_offset + view.byte_length > min(len(self.buffer), buffer.byte_length):
-            raise LumigraphError(
-                f"{self.path}: accessor {index} promises {accessor.count:,} rows, and the buffer of "
-                f"{len(self.buffer):,} bytes ends before; copy or download it again"
-            )
-        start, strides = view.byte_offset + accessor.byte_offset, (stride, dtype.itemsize)
-        found = np.ndarray((accessor.count, width), dtype, self.buffer, start, strides).astype(np.float32)
+        found = np.zeros((accessor.count, width), np.float32)
+        if accessor.buffer_view is not None:
+            place = accessor.buffer_view, accessor.byte_offset, accessor.count
+            found = self._stored(index, *place, dtype, width).astype(np.float32)
+        if accessor.sparse is not None:
+            with reading(self.path, "has a sparse accessor that contradicts itself", "export it again"):
+                said = typed(Sparse, accessor.sparse, self.path)
+                there, values, kind = said.indices, said.values, KINDS[said.indices.component_type]
+                rows = self._stored(index, there.buffer_view, there.byte_offset, said.count, np.dtype(kind), 1)[:, 0]
+                changed = self._stored(index, values.buffer_view, values.byte_offset, said.count, dtype, width)
+                found[rows] = changed
         if accessor.normalized and dtype.kind in "iu":
             found = np.maximum(found / np.float32(np.iinfo(dtype).max), -1)
         return found
+
+    def _stored(self, index: int, view: int, offset: int, count: int, dtype: np.dtype, width: int) -> np.ndarray:
+        """Rows of a part of the buffer. index: of the accessor, for the sentence on a part that is too short"""
+        about = self.one(self.about.buffer_views, view, "buffer view")
+        buffer = self.one(self.about.buffers, about.buffer, "buffer")
+        if about.buffer or buffer.uri is not None:
+            raise LumigraphError(f"{self.path} leads to other files for its numbers; export it as one .glb")
+        stride = about.byte_stride or dtype.itemsize * width
+        end = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
+        if end > about.byte_length or about.byte_offset + about.byte_length > min(len(self.buffer), buffer.byte_length):
+            raise LumigraphError(
+                f"{self.path}: accessor {index} promises {count:,} rows, and the buffer of {len(self.buffer):,} bytes "
+                "ends before; copy or download it again"
+            )
+        start = about.byte_offset + offset
+        return np.ndarray((count, width), dtype, self.buffer, start, (stride, dtype.itemsize))
 
     def picture(self, index: int) -> bytes:
         """Bytes of an embedded image. Raises LumigraphError for an external one."""

@@ -54,7 +54,7 @@ HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behin
 MAGIC, GZIP_VERSION, NEWEST_VERSION = b"NGSP", 3, 4
 HEADER_V4 = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
 STREAM = struct.Struct("<QQ")  # packed and unpacked bytes
-ANTIALIASED, EXTENDED = 1, 2  # flags
+ANTIALIASED, EXTENDED, LEVELS = 1, 2, 128  # flags; the last is Spark's, for a tree of levels of detail
 MAX_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
 MAX_FIXED = 2**23 - 1
 COLOUR_SCALE = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
@@ -141,6 +141,8 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     check_room(path, count, (degree + 1) ** 2, limit // MAX_DEFLATE_RATIO, count * sum(widths))
     columns = [np.frombuffer(take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
     behind = stream.read(MAX_EXTENSION_BYTES + 1)  # to the end, where gzip's checksum is
+    if flags & LEVELS:
+        raise LumigraphError(f"{path} has levels of detail, which are not read; save it without them")
     if len(behind) > (MAX_EXTENSION_BYTES if flags & EXTENDED else 0):
         raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
     return extended(path, _cloud(path, columns, version, bits, flags), behind)

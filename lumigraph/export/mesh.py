@@ -57,6 +57,7 @@ CUT_ROUNDS = 30  # rounds of diffusion in which the line where an open surface i
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
+MIN_PIECE = 0.01  # of the largest piece's area, below which a piece is fog
 CUT_STRIDE = 16  # pixels that show a surface, of which one is asked for the share outside
 OUTSIDE, WAY_OUT = "lies outside the meshed region", "a larger --extent, --box or --sphere holds more"
 
@@ -103,7 +104,8 @@ def extract_mesh(
     grid, way = make_grid(limits, cell), best_way(method)[0] if options.way == "auto" else options.way
     faces = TEXTURED_FACES if options.faces is None and texture is not None else options.faces
     whole = crop is None and options.extent is None  # of an own mesh: its size is that of what was measured
-    made = own_mesh(method, None if whole else holds, options.keep, options.smooth, faces) if way == "own" else None
+    keep = (0.0 if way == "own" else MIN_PIECE) if options.keep is None else options.keep
+    made = own_mesh(method, None if whole else holds, keep, options.smooth, faces) if way == "own" else None
     if made is not None and texture is None:
         return made
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
@@ -143,7 +145,7 @@ def extract_mesh(
             triangles = triangles[seen_well[triangles].all(-1)]
         corners, triangles = manifold(triangles)
         if len(triangles):
-            vertices, triangles = larger_pieces(vertices[corners], triangles, options.keep, seen_well[corners])
+            vertices, triangles = larger_pieces(vertices[corners], triangles, keep, seen_well[corners])
     if not len(triangles):
         raise LumigraphError(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "

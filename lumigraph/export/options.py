@@ -161,7 +161,7 @@ class MeshOptions:
     """Width and height of the texture; larger shows finer print, and takes more memory and a larger file."""
     lit: bool = False
     """Let lights of a viewer act on a textured mesh; otherwise it shines in the photographs' own light."""
-    keep: Annotated[Share, option("SHARE")] = 0.01
+    keep: Annotated[Share | None, option("SHARE", "0.01, of own meshes 0")] = None
     """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
     unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
     """Unseen surface: close it for a watertight mesh, or cut it."""

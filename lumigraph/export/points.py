@@ -79,8 +79,8 @@ def extract_points(
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
     good = [wanted(seen, crop) for seen in depth_maps]
     if crop is not None:
-        kept, every = (sum(int(x.sum()) for x in masks) for masks in (good, [wanted(x, None) for x in depth_maps]))
-        name_cut(1 - kept / max(every, 1), "lies outside the crop", "a larger one holds more")
+        inside, every = (sum(int(x.sum()) for x in masks) for masks in (good, [wanted(x, None) for x in depth_maps]))
+        name_cut(1 - inside / max(every, 1), "lies outside the crop", "a larger one holds more")
     share = min(1.0, CANDIDATES_PER_POINT * options.count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import difflib
 import itertools
 import re
@@ -20,8 +22,25 @@ def natural(name: str) -> tuple[str, str]:
 
 
 def next_free(prefix: str) -> Path:
-    """The first of prefix-1, prefix-2, ... that does not exist yet."""
-    return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())
+    """The first of prefix-1, prefix-2, ... that does not exist yet, made as an empty folder, so that no other process
+    takes it. It is deleted at the end of this process if it is still empty."""
+    for n in itertools.count(1):
+        path = Path(f"{prefix}-{n}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError:  # said where it is written to
+            return path
+        atexit.register(discard, path)
+        return path
+    raise AssertionError("whole numbers do not end")
+
+
+def discard(folder: Path) -> None:
+    """Delete a folder if it is empty."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def counted(number: int, noun: str) -> str:

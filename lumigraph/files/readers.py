@@ -17,9 +17,11 @@ READERS = (
     "phones",
     "kitti",
     "zju_mocap",
+    "rig",
     "colmap",
     "llff",
     "light_field",
+    "recording",
     "minecraft",
 )
 NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types

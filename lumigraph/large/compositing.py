@@ -168,20 +168,16 @@ class InBlocks(Method):
             found = (*found, Control(EXPOSURE, 0.0, (least, most), unit="stops", about=about))
         return found
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same blocks with evidence: controls for those that have them, or a Photograph to which each block in
-        reach of its camera fits its appearance."""
-        mine: list[Any] = [piece for piece in evidence if isinstance(piece, self.accepts)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
-        assert isinstance(told, InBlocks)
-        passed = {name: value for name, value in told.settings.items() if name != EXPOSURE and name in controls}
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Give controls to the blocks that have them, and a Photograph to each block in reach of its camera, which fits
+        its appearance."""
+        passed = {name: value for name, value in self.settings.items() if name != EXPOSURE and name in controls}
         parts = self.blocks.each(lambda part: part.with_controls(passed))
         if EXPOSURE in controls and self.usual is not None:
-            parts = parts.each(partial(exposed, exposure=self.usual + float(told.settings[EXPOSURE])))
-        for photograph in mine:
+            parts = parts.each(partial(exposed, exposure=self.usual + float(self.settings[EXPOSURE])))
+        for photograph in evidence:
             parts = self._seen_in(photograph, parts)
-        told.blocks = parts
-        return told
+        self.blocks = parts
 
     def _seen_in(self, photograph: Photograph, parts: Nearby) -> Nearby:
         """Parts in the appearance and, if known, the exposure of a photograph, for those in reach of its camera."""

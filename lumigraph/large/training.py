@@ -29,7 +29,7 @@ from ..errors import LumigraphError
 from ..exchange import write_gaussians
 from ..files import scene_name
 from ..files.locks import lock_folder
-from ..files.names import next_free
+from ..files.names import discard, next_free
 from ..method.capabilities import HasGaussians, can
 from ..opening import kind_of
 from ..readers import Places
@@ -346,5 +346,6 @@ def unfinished(prefix: str, plan: Plan) -> Path:
     latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
     if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
         if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
+            discard(free)
             return latest
     return free

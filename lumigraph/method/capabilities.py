@@ -174,7 +174,7 @@ class CanCompress(Protocol):
 class CanDraw(Protocol):
     """Can generate objects of a category."""
 
-    def drawn(self, seed: int) -> Any:
+    def draw_object(self, seed: int) -> Any:
         """The method with a generated object, sampled by a seed."""
 
 

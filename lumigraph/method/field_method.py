@@ -98,12 +98,12 @@ class FieldMethod(RayMethod, ABC):
 
     def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
         """Passes along rays of photographs with jitter, and the sampler's loss terms by name."""
-        return self.learn_along(self.moved(rays), generator)
+        return self.learn_along(self.refine_rays(rays), generator)
 
-    def moved(self, rays: Rays) -> Rays:
+    def refine_rays(self, rays: Rays) -> Rays:
         """Rays of photographs with their learnt poses."""
         for part in self.parts:
-            rays = part.moved(rays)
+            rays = part.refine_rays(rays)
         return rays
 
     def learn_along(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:

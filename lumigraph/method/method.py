@@ -150,6 +150,10 @@ class Method(nn.Module, ABC):
         """True if training is complete at any budget, such as after the last photograph of a fusion."""
         return False
 
+    def check_data(self, data: Any) -> None:
+        """Raise LumigraphError for data that this method cannot learn from; called before a new run compiles or learns
+        anything. Nothing is refused by default."""
+
     def begin(self, data: Any, seconds: float = math.inf) -> None:
         """Initialise from the data; called once, before the first step of a new run.
 
@@ -231,13 +235,10 @@ class Method(nn.Module, ABC):
         """The method with evidence (photographs, points, a light ...) or values of `controls`.
 
         The result shares all parameters and is an ordinary method for films, viewer and exports.
-        A method that takes evidence overrides this, and calls it for its controls.
         Raises LumigraphError for anything that the method does not accept.
         """
-        parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
-        chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
-        for piece, names in zip(evidence, chosen, strict=True):
-            if not names:
+        for piece in evidence:
+            if not isinstance(piece, self.takes):
                 kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
                 kind = type(piece).__name__
                 raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
@@ -251,10 +252,15 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.settings = self.settings | {name: known[name].checked(value) for name, value in controls.items()}
-        for piece, names in zip(evidence, chosen, strict=True):
-            for name in names:
-                told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
+        for piece in evidence:
+            for name, part in told.named_children():
+                if isinstance(part, Part) and isinstance(piece, part.accepts):
+                    told._modules[name] = part.adapted(told, piece)
+        told.take_evidence([piece for piece in evidence if isinstance(piece, self.accepts)], controls)
         return told
+
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Change the copy that `given` returns, by evidence of the class's own kinds and values of controls."""
 
     def control(self, name: str) -> Value:
         """Value of a control: as set, or its default."""

@@ -56,7 +56,7 @@ class Part(nn.Module):
 
     # Rendering
 
-    def moved(self, rays: Rays) -> Rays:
+    def refine_rays(self, rays: Rays) -> Rays:
         """Rays of photographs with their learnt poses."""
         return rays
 

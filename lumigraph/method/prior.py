@@ -59,4 +59,4 @@ class Prior:
 
     def draw(self, seed: int) -> Method:
         """Generate an ordinary method of a new object. Raises LumigraphError for a prior that cannot."""
-        return needs(self.method, CanDraw).drawn(seed)
+        return needs(self.method, CanDraw).draw_object(seed)

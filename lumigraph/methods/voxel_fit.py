@@ -120,13 +120,12 @@ class VoxelFit(FieldMethod):
 
     # Learning
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+    def check_data(self, data: Scene) -> None:
         if data.frame.is_open:
             raise LumigraphError(
                 "voxel-fit fills the box of interest alone, and this capture goes on to the horizon; train dvgo, or "
                 "cut out the photographs' object and give them an alpha channel"
             )
-        super().begin(data, seconds)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Squared errors of colours and silhouettes, entropy of opacity, total variation."""

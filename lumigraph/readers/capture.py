@@ -105,6 +105,7 @@ class Capture:
     tracks:   boxes of moving rigid objects, source's frame and units, times as in `Shot.time`
     skeleton: bones of a character at all times, source's frame and units
     blocks:   of a block world, cubes with an edge of one unit of the source
+    poseless: poses are unknown, and those of the shots mean nothing
     kept:     cache pictures even where they fit into memory, since they took long to make
     """
 
@@ -126,6 +127,7 @@ class Capture:
     skeleton: Skeleton | None = None
     kept: bool = False
     blocks: BlockLabels | None = None
+    poseless: bool = False
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with only some of its points."""

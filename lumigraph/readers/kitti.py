@@ -1,4 +1,4 @@
-"""Drives in the layout of KITTI's tracking benchmark (Geiger et al. 2012): image_02, label_02, calib, maybe oxts.
+"""Drives in the layouts of KITTI's benchmarks of tracking and of odometry (Geiger et al. 2012).
 
     image_02/0006/000000.png     the left colour camera, rectified
     label_02/0006.txt            a line for each thing on each photograph: frame, track, type, truncated, occluded,
@@ -7,6 +7,9 @@
     calib/0006.txt               P0 to P3, and the rotations and places of the cameras, the laser and the inertial unit
     oxts/0006.txt                latitude, longitude, altitude, roll, pitch, yaw and more of each photograph
 
+Odometry: sequences/00/image_2/000000.png, calib.txt and maybe times.txt (seconds) in it, and poses/00.txt or poses.txt
+in it: camera-to-world (3x4, rows) of camera 0 for each photograph.
+
 Name the folder of a sequence, or one that holds these four of a single sequence. Lengths are metres, moments are
 numbers of photographs. Places of things are in the rectified frame of camera 0. Without oxts the camera stands still.
 """
@@ -14,6 +17,7 @@ numbers of photographs. Places of things are in the rectified frame of camera 0.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +33,8 @@ from ..geometry import to_quaternion
 from .capture import Capture, Shot
 from .pictures import list_images
 
-EXPECTED_FILES = "image_02, label_02 and calib (KITTI's tracking benchmark)"
+EXPECTED_FILES = "image_02, label_02 and calib (KITTI's tracking), or image_2, calib.txt and poses.txt (its odometry)"
+ODOMETRY_PICTURES, SIDE = "image_2", 4  # and columns of a pose
 PICTURES, LABELS, CALIBRATION, INERTIAL = "image_02", "label_02", "calib", "oxts"
 IGNORED_TYPE = "DontCare"
 MAX_NUMBER = 1e9  # in any file, whatever its unit
@@ -41,6 +46,8 @@ NEAR = 2.0  # metres in front of the camera, within which there is nothing
 
 
 def recognises(folder: Path) -> bool:
+    if (folder / ODOMETRY_PICTURES).is_dir() and (folder / "calib.txt").is_file():
+        return odometry(folder) is not None
     if folder.parent.name == PICTURES:
         return (folder.parent.parent / LABELS / f"{folder.name}.txt").is_file()
     return all((folder / name).is_dir() for name in (PICTURES, LABELS, CALIBRATION))
@@ -49,27 +56,57 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path) -> Capture:
     """Photographs of the left colour camera, with the tracks of all labelled objects. Raises LumigraphError for several
     sequences, and for malformed files."""
+    if (poses := odometry(folder)) is not None:
+        return read_odometry(folder, poses)
     root, name = sequence(folder)
     pictures = [root / PICTURES / name / x for x in list_images(root / PICTURES / name)]
     matrices = read_calibration(root / CALIBRATION / f"{name}.txt")
     inertial = root / INERTIAL / f"{name}.txt"
     drive, origin = read_drive(inertial, matrices) if inertial.is_file() else (None, None)
-    projection = matrices["P2"]
+    shots = shots_of(pictures, root / CALIBRATION / f"{name}.txt", matrices["P2"], inertial, drive)
+    tracks = read_labels(root / LABELS / f"{name}.txt", drive)
+    up = (0.0, -1.0, 0.0) if drive is None else (0.0, 0.0, 1.0)
+    return Capture(str(folder), shots, up=up, reach=REACH, near=NEAR, origin=origin, tracks=tracks)
+
+
+def shots_of(
+    pictures: list[Path], calibration: Path, projection: np.ndarray, source: Path, drive: list[np.ndarray] | None
+) -> list[Shot]:
+    """Photographs of camera 2. drive: poses of camera 0 by number, from `source`; None: it stands still"""
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     lens = Pinhole(torch.tensor([[fx, fy]]), torch.tensor([[cx + 0.5, cy + 0.5]]))
-    with reading(root / CALIBRATION / f"{name}.txt", "has a P2 that is no projection", "restore the file"):
+    with reading(calibration, "has a P2 that is no projection", "restore the file"):
         aside = -np.linalg.solve(projection[:, :3], projection[:, 3])  # camera 2 in the frame of camera 0
     shots = []
     for path in pictures:
         frame = frame_number(path)
         if drive is not None and frame >= len(drive):
-            raise LumigraphError(f"{inertial} has {len(drive)} lines, and none for {path.name}; give one for each")
+            raise LumigraphError(f"{source} has {len(drive)} lines, and none for {path.name}; give one for each")
         pose = np.eye(4) if drive is None else drive[frame]
         pose = np.concatenate([pose[:3, :3], (pose[:3, :3] @ aside + pose[:3, 3])[:, None]], 1)
         shots.append(Shot(path.name, pose, lens, None, {1: path}, time=float(frame)))
-    tracks = read_labels(root / LABELS / f"{name}.txt", drive)
-    up = (0.0, -1.0, 0.0) if drive is None else (0.0, 0.0, 1.0)
-    return Capture(str(folder), shots, up=up, reach=REACH, near=NEAR, origin=origin, tracks=tracks)
+    return shots
+
+
+def odometry(folder: Path) -> Path | None:
+    """Poses of a sequence of the odometry benchmark; None without any, and for another layout."""
+    if not (folder / ODOMETRY_PICTURES).is_dir():
+        return None
+    places = folder / "poses.txt", *(x / "poses" / f"{folder.name}.txt" for x in (folder.parent.parent, folder.parent))
+    return next((path for path in places if path.is_file()), None)
+
+
+def read_odometry(folder: Path, poses: Path) -> Capture:
+    """Photographs of the left colour camera along its drive, at times in seconds if they are known."""
+    rows = read_rows(poses, 3 * SIDE)
+    drive = [whole(np.array(row[: 3 * SIDE], np.float64).reshape(3, SIDE)) for row in rows]
+    pictures = [folder / ODOMETRY_PICTURES / x for x in list_images(folder / ODOMETRY_PICTURES)]
+    calibration, times = folder / "calib.txt", folder / "times.txt"
+    shots = shots_of(pictures, calibration, read_calibration(calibration)["P2"], poses, drive)
+    seconds = [float(row[0]) for row in read_rows(times, 1)] if times.is_file() else []
+    if len(seconds) >= len(drive):
+        shots = [replace(shot, time=seconds[int(shot.time or 0)]) for shot in shots]
+    return Capture(str(folder), shots, up=(0.0, -1.0, 0.0), reach=REACH, near=NEAR)
 
 
 def sequence(folder: Path) -> tuple[Path, str]:

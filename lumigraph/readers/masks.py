@@ -88,9 +88,10 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
 
 def other_masks(shots: list[Shot], folder: Path) -> Path | None:
     """A folder or a file of masks in a place of another program, if no photograph has a mask."""
-    if any(shot.mask is not None or not isinstance(shot.image, dict) for shot in shots[:1]) or not shots:
+    files = shots[0].image if shots and shots[0].mask is None else None
+    if not isinstance(files, dict):
         return None
-    picture = shots[0].image[min(shots[0].image)]
+    picture = files[min(files)]
     beside = [picture.with_name(f"{name}.png") for name in (f"{picture.stem}_mask", f"dynamic_mask_{picture.stem}")]
     return next((x for x in (*beside, *(folder / name for name in OTHER_MASKS)) if x.exists()), None)
 

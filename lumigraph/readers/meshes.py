@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from ..datasets.dataset import splits_of
 from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
-from ..exchange.gltf import refuse_compressed
+from ..exchange.gltf import plain, refuse_compressed
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
 from ..files.reading import reads
@@ -76,10 +77,15 @@ def read_mesh(path: Path) -> Mesh:
 
     if path.stat().st_size > free_memory():
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
-    if path.suffix.lower() in (".glb", ".gltf"):
+    suffix, loaded = path.suffix.lower(), None
+    if suffix in (".glb", ".gltf"):
         refuse_compressed(path)
-    own = path.suffix.lower() == ".ply" and not has_texture(path)
-    loaded: Any = read_ply(path) if own else trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
+        beside = trimesh.resolvers.FilePathResolver(str(path))
+        loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb", resolver=beside)
+    elif suffix == ".ply" and not has_texture(path):
+        loaded = read_ply(path)
+    else:
+        loaded = trimesh.load(path, process=False, file_type=suffix[1:])
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]

@@ -5,6 +5,10 @@ focal lengths, centre, size), keyframes/images/N.jpg or keyframes/corrected_imag
 bits, millimetres). Record3D, RGBD: metadata.json (K by columns, poses as qx qy qz qw x y z, size of the depth) and
 rgbd/N.jpg, rgbd/N.depth (float32 metres, compressed by LZFSE). Camera axes are OpenGL's, y is up, depth is along the
 optical axis, 0 and NaN where nothing was measured. Lengths are metres.
+
+Stray Scanner: odometry.csv (timestamp, frame, x, y, z, qx, qy, qz, qw, or the last seven; +y down, +z forward),
+camera_matrix.csv, depth/000000.png or .npy (millimetres), confidence/000000.png (0 to 2; depth of 0 is left out), and
+the film rgb.mp4, of which `lumigraph capture FOLDER` writes frames, as rgb/000000.jpg.
 """
 
 from __future__ import annotations
@@ -18,18 +22,20 @@ import torch
 
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..files import is_file, read_bytes, read_json
+from ..files import is_file, read_bytes, read_json, read_text
 from ..files.names import natural
 from ..files.ranges import Coordinate, Positive, Side
 from ..files.reading import reading
 from ..geometry import to_matrix
 from .capture import Capture, PixelPlane, Shot
-from .pictures import find_file
+from .numbers import read_numbers
+from .pictures import find_file, list_images, measure, readable, stat
 
-EXPECTED_FILES = "keyframes/ (Polycam, raw data) or metadata.json and rgbd/ (Record3D)"
+EXPECTED_FILES = "keyframes/ (Polycam, raw data), metadata.json and rgbd/ (Record3D), or odometry.csv (Stray Scanner)"
 OPENCV = np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera axes
 UP = (0.0, 1.0, 0.0)
 MILLIMETRES = 1e-3
+STRAY_FILES = "odometry.csv", "camera_matrix.csv"
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,9 @@ class Record3DMetadata:
 
 
 def recognises(folder: Path) -> bool:
-    return is_polycam(folder) or ((folder / "metadata.json").is_file() and (folder / "rgbd").is_dir())
+    return (
+        is_polycam(folder) or is_stray(folder) or ((folder / "metadata.json").is_file() and (folder / "rgbd").is_dir())
+    )
 
 
 def is_polycam(folder: Path) -> bool:
@@ -87,7 +95,63 @@ def is_polycam(folder: Path) -> bool:
 
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for malformed files."""
+    if is_stray(folder):
+        return read_stray(folder)
     return read_polycam(folder) if is_polycam(folder) else read_record3d(folder)
+
+
+def is_stray(folder: Path) -> bool:
+    return all((folder / name).is_file() for name in STRAY_FILES)
+
+
+def stray_path(folder: Path) -> dict[int, list[float]]:
+    """Position and quaternion x y z w of each frame of Stray Scanner, by number."""
+    path = folder / STRAY_FILES[0]
+    with reading(path, "has lines that are no poses", "export it again"):
+        words = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
+        rows = [list(map(float, row)) for row in words[not words[0][0].strip().lstrip("-")[:1].isdigit() :]]
+        return {int(row[1]) if len(row) > 8 else i: row[-7:] for i, row in enumerate(rows)}
+
+
+def read_stray(folder: Path) -> Capture:
+    """Frames that are pictures, with depth of confidence 1 and more. Raises LumigraphError for a film alone."""
+    pictures = {int(Path(x).stem): folder / "rgb" / x for x in list_images(folder / "rgb") if Path(x).stem.isdecimal()}
+    if not pictures:
+        raise LumigraphError(
+            f"{folder} is a recording of Stray Scanner, whose pictures are in its film; write frames of it, with the "
+            f"recorded poses and depth: lumigraph capture {folder}"
+        )
+    path = folder / STRAY_FILES[1]
+    with reading(path, "holds no 3x3 matrix", "export it again"):
+        k = np.array([line.split(",") for line in read_text(path).split()], np.float64).reshape(3, 3)
+    lens, shots = Pinhole(torch.tensor([[k[0, 0], k[1, 1]]]).float(), torch.tensor([[k[0, 2], k[1, 2]]]).float()), []
+    for number, (*place, qx, qy, qz, qw) in stray_path(folder).items():
+        if number in pictures:
+            rotation = to_matrix(torch.tensor([[qw, qx, qy, qz]], dtype=torch.float64))[0].numpy()
+            pose = np.concatenate([rotation, np.array(place)[:, None]], 1)
+            files = {kind: find_measured(folder / kind, number) for kind in ("depth", "confidence")}
+            planes = {} if files["depth"] is None else {"depth": confident(files["depth"], files["confidence"])}
+            size = measure(pictures[number])[0]
+            shots.append(Shot(f"rgb/{number:06}", pose, lens, size, {1: pictures[number]}, planes=planes))
+    return Capture(str(folder), shots, up=UP)
+
+
+def find_measured(folder: Path, number: int) -> Path | None:
+    return next((x for suffix in (".png", ".npy") if (x := folder / f"{number:06}{suffix}").is_file()), None)
+
+
+def confident(depth: Path, confidence: Path | None) -> PixelPlane:
+    """Depth of a file, 0 where its confidence is 0."""
+    if confidence is None:
+        return PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))
+    identity = f"{depth.resolve()} {stat(depth)} {stat(confidence)}"
+    values = partial(masked_depth, depth, confidence)
+    return PixelPlane(values, "z-depth", MILLIMETRES, unknown=(0,), dtype=np.dtype(np.uint16), identity=identity)
+
+
+def masked_depth(depth: Path, confidence: Path) -> np.ndarray:
+    with readable(depth):
+        return np.where(read_numbers(confidence) > 0, read_numbers(depth, "depth"), 0).astype(np.uint16)
 
 
 def opencv(pose: np.ndarray) -> np.ndarray:

@@ -31,6 +31,9 @@ IMAGE_SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES,
     ".avif", ".jfif", ".jp2",
 )  # fmt: skip
+LARGE = (
+    64_000_000  # pixels beyond which a JPEG is decoded at a half, a quarter or an eighth, not below three final sizes
+)
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
@@ -232,7 +235,8 @@ def measure(path: Path) -> tuple[Size, int | None]:
         if is_tiff(path):
             return kind_of(path).size, tiff_tags(path).get(EXIF_ORIENTATION)
         with Image.open(path) as image:
-            check_pixels(image.size)
+            large = image.format in ("JPEG", "MPO") and math.prod(image.size) > LARGE
+            check_pixels(image.size, 1 if large else 4)
             return image.size, image.getexif().get(EXIF_ORIENTATION)
 
 
@@ -248,6 +252,8 @@ def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     if (kind := deep(path)) is not None:
         return as_bytes(resized(read_deep(path, turn), size, kind.encoding), kind.encoding)
     with readable(path), Image.open(path) as image:
+        if math.prod(image.size) > LARGE:
+            image.draft(None, (3 * min(size),) * 2)  # what is left is averaged
         return np.asarray(srgb_image(image, turn, size))
 
 

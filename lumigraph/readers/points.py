@@ -48,10 +48,15 @@ def read_vertices(path: Path, *further: str) -> dict[str, np.ndarray]:
 
 
 def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
-    """red, green and blue of a PLY file's rows: integers up to 255, or floats up to 1 or to 255. None without them."""
-    if not {*COLOURS} <= {*plain_names(rows)}:
+    """red, green and blue of a PLY file's rows, maybe as diffuse_red: integers up to 255 or to 65535, or floats up to 1
+    or to 255. None without them."""
+    here = {*plain_names(rows)}
+    names = next((x for x in (COLOURS, [f"diffuse_{name}" for name in COLOURS]) if {*x} <= here), None)
+    if names is None:
         return None
-    found = np.stack([rows[name] for name in COLOURS], -1)
+    found = np.stack([rows[name] for name in names], -1)
+    if found.dtype.kind in "ui" and found.max(initial=0) > 255:
+        found = np.rint(found / 257)
     if found.dtype.kind == "f":
         found = np.nan_to_num(found * (1 if found.max(initial=0) > 1 else 255)).round()
     return found.clip(0, 255).astype(np.uint8)

@@ -32,7 +32,7 @@ from .capture import MAX_COORDINATE, Capture, PixelPlane, Shot
 from .pictures import stat, upright_size
 
 CLOUD_SUFFIXES = (".las", ".laz", ".e57")
-OTHER_CLOUDS = (".pcd", ".xyz", ".pts", ".ptx")  # that are known by name and not read
+OTHER_CLOUDS = (".pcd", ".xyz", ".pts", ".ptx", ".asc")  # that are known by name and not read
 SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
 WORKER = Path(__file__).with_name("cloud_worker.py")

@@ -66,12 +66,20 @@ def unposed(capture: Capture, options: Unposed) -> Capture:
             shot,
             pose=shots[0].pose,
             split="test" if i % HOLD_OUT == FIRST_HELD_OUT else "train",
-            about=shot.about | {TRUE_POSE: checked_pose(shot, capture.source)},
+            about=shot.about | ({} if capture.poseless else {TRUE_POSE: checked_pose(shot, capture.source)}),
         )
         for i, shot in enumerate(shots)
     ]
     return replace(
-        capture, shots=placed, points=None, point_colours=None, sightings=None, bounds=box, reach=None, near=NEAR
+        capture,
+        poseless=False,
+        shots=placed,
+        points=None,
+        point_colours=None,
+        sightings=None,
+        bounds=box,
+        reach=None,
+        near=NEAR,
     )
 
 

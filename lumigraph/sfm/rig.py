@@ -12,6 +12,8 @@ import numpy as np
 
 from ..errors import LumigraphError
 from ..files import claim_folder, is_file, read_json, replacing_folder, write_json
+from ..readers import phones
+from ..readers.rig import calibration, cameras_of
 from .folder import POINTS_FILE
 from .options import MotionOptions
 from .photos.copies import save
@@ -21,6 +23,7 @@ from .photos.video import picked
 from .reconstruction import MIN_VIEWS, reconstruct
 
 CLOCKS_FILE = "clocks.json"  # seconds after the first camera at which each video begins, by its name
+RECORDED_FILM, MAX_RECORDED = "rgb.mp4", 400  # of Stray Scanner; frames taken by default
 MAX_MOMENTS = 120  # taken by default
 SAME_RATE, SAME_LENGTH = 0.01, 0.05  # relative, and seconds: differences that are not worth a sentence
 
@@ -50,7 +53,9 @@ def is_rig(path: Path) -> bool:
 
 
 def list_videos(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if is_video(path))
+    """Videos in a folder, or in its `videos`."""
+    found = sorted(path for path in folder.iterdir() if is_video(path))
+    return found if found or not (folder / "videos").is_dir() else list_videos(folder / "videos")
 
 
 def films_of(folder: Path) -> list[RigVideo]:
@@ -137,6 +142,37 @@ def capture_rig(
     return {"cameras": f"{count} of {len(films)}{found}", "moments": f"{len(moments)}, {step_of(moments)}"}, said
 
 
+def is_recorded(path: Path) -> bool:
+    """True for a recording with poses whose pictures are a film: Stray Scanner's."""
+    return phones.is_stray(path) and is_video(path / RECORDED_FILM) and not (path / "rgb").is_dir()
+
+
+def capture_recorded(
+    source: Path, folder: Path, count: int | None = None, track: Track = untracked
+) -> tuple[dict[str, Any], list[str]]:
+    """Write frames of a recording's film beside its poses and depth, as pictures of the same layout. count: of frames,
+    MAX_RECORDED at most by default. Returns rows to print, and remarks."""
+    claim_folder(folder, "capture")
+    numbers, tags = sorted(phones.stray_path(source)), tags_of(source / RECORDED_FILM)
+    chosen = [
+        numbers[i] for i in np.linspace(0, len(numbers) - 1, min(count or MAX_RECORDED, len(numbers))).astype(int)
+    ]
+    with replacing_folder(folder, "capture") as partial:
+        (partial / "rgb").mkdir(parents=True)
+        taken = track(picked(source / RECORDED_FILM, chosen, tags), "Taking frames", len(chosen))
+        written = [
+            (number, save(picture, partial / "rgb" / f"{number:06}.jpg", ".jpg"))[0] for number, picture, _ in taken
+        ]
+        for kind in ("depth", "confidence"):
+            for file in (found for number in written if (found := phones.find_measured(source / kind, number))):
+                (partial / kind).mkdir(exist_ok=True)
+                shutil.copyfile(file, partial / kind / file.name)
+        for name in phones.STRAY_FILES:
+            shutil.copyfile(source / name, partial / name)
+    rows = {"photographs": f"{len(written)} of {len(numbers)} frames, with the recorded poses"}
+    return rows, [f"{source / RECORDED_FILM}: {tags.fault}"] if tags.fault else []
+
+
 def step_of(moments: Sequence[float]) -> str:
     return f"{1000 * (moments[1] - moments[0]):.0f} ms apart" if len(moments) > 1 else "of one frame"
 
@@ -155,13 +191,17 @@ def take(film: RigVideo, moments: Sequence[float], folder: Path, tags: Tags) -> 
 
 def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, Any]] | None:
     """Frames of the transforms.json beside videos, by the videos' names without suffixes, each with the file's common
-    lens; None without one. Raises LumigraphError for a video without a pose."""
+    lens, or those of a published rig; None without either. Raises LumigraphError for a video without a pose."""
     path = source / "transforms.json"
     if not is_file(path):
-        return None
-    made = read_json(path)
-    common = {name: value for name, value in made.items() if name != "frames"}
-    frames = {Path(frame["file_path"]).stem: common | frame for frame in made.get("frames", []) if "file_path" in frame}
+        if (name := calibration(source)) is None:
+            return None
+        path, frames = source / name, cameras_of(source, [film.path.stem for film in films])
+    else:
+        made = read_json(path)
+        common = {name: value for name, value in made.items() if name != "frames"}
+        said = [frame for frame in made.get("frames", []) if "file_path" in frame]
+        frames = {Path(frame["file_path"]).stem: common | frame for frame in said}
     if missing := [film.path.name for film in films if film.path.stem not in frames]:
         raise LumigraphError(f"{path} has no pose of {missing[0]}; add a frame with that file_path")
     return frames

@@ -13,11 +13,13 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.ndimage import shift
 
+from ..camera.lens import Pinhole
 from ..color.srgb import linear_from_srgb, srgb_from_linear
 from ..errors import LumigraphError
 from ..geometry import Similarity, evenly
@@ -29,7 +31,7 @@ from .stage import Nuisances, SyntheticStage
 from .textures import Bricks, Checker, Marble, Mottle, Stripes, Texture, Wood
 from .world import Material, Object, Pose, World, nested, rotation_about
 
-STATUE_PARTS = 9
+BODIES = 5  # of a statue
 THIN = 0.012  # radius of a statue's rods, as a share of its half-size
 RING = 14  # things of an open background
 CLUTTER_WAY, CLUTTER_ASIDE, CLUTTER_SIZE = 0.3, 0.05, 0.02  # shares of the distance from a camera to the middle
@@ -70,7 +72,9 @@ def everywhere(stage: SyntheticStage, change: Callable[[World], World]) -> Synth
     def after(world: Callable) -> Callable:
         return lambda moment: change(world(moment))
 
-    worlds = {name: after(old) for name in ("moving", "differing", "lasting") if (old := getattr(stage, name))}
+    worlds: dict[str, Any] = {
+        name: after(old) for name in ("moving", "differing", "lasting") if (old := getattr(stage, name))
+    }
     return replace(stage, world=change(stage.world), called=None, **worlds)
 
 
@@ -99,27 +103,23 @@ def statue(seed: int, stage: SyntheticStage) -> Iterator[Object]:
     """A random object in the box of interest: a body on a hollow base, with a handle, thin rods and a cup."""
     random, middle = np.random.default_rng((seed, 0x57A7)), middle_of(stage)
     half = 0.5 * (np.array(stage.bounds[1]) - stage.bounds[0])
-    size, floor = float(half.min()), float(-half[2])
+    size = float(half.min())
 
     def part(shape: SolidShape, x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Object:
-        place = Pose(tuple((middle + (x, y, z)).tolist())) @ Pose.at(0, 0, 0, turn, tilt)
+        place = Pose(tuple(middle.tolist())) @ Pose.at(x * size, y * size, z * size - half[2], turn, tilt)
         paint = Material(textures(random, 0.15 * size), gloss=random.uniform(0, 0.5), roughness=0.4)
         return Object(shape, paint, place, "statue")
 
-    base = 0.3 * size
-    yield part(
-        Arch((0.6 * size, 0.6 * size, base), 0.35 * size, 0.1 * size), 0, 0, floor + base, random.uniform(0, 360)
-    )
-    for _ in range(STATUE_PARTS - 4):
-        radius = random.uniform(0.15, 0.35) * size
+    arch = Arch((0.6 * size, 0.6 * size, 0.3 * size), 0.35 * size, 0.1 * size)
+    yield part(arch, 0, 0, 0.3, random.uniform(0, 360))
+    for _ in range(BODIES):
+        radius, (x, y, z) = random.uniform(0.15, 0.35) * size, random.uniform((-0.4, -0.4, 0.85), (0.4, 0.4, 1.1))
         body = Ball(radius) if random.integers(2) else Cuboid((radius, 0.8 * radius, radius), 0.2 * radius)
-        x, y = random.uniform(-0.4, 0.4, 2) * size
-        yield part(body, x, y, floor + 2 * base + random.uniform(0.5, 1.0) * size * 0.5, *random.uniform(0, 90, 2))
-    yield part(Torus(0.3 * size, 0.06 * size), 0.5 * size, 0, floor + 0.9 * size, random.uniform(-30, 30), 90)
-    yield part(Cone(0.12 * size, 0.3 * size, 0.15 * size), -0.4 * size, 0.2 * size, floor + 1.3 * size)
-    for _ in range(2):
-        rod = Cylinder(THIN * size, 0.5 * size)
-        yield part(rod, *random.uniform(-0.3, 0.3, 2) * size, floor + 1.3 * size, *random.uniform(0, 60, 2))
+        yield part(body, x, y, z, random.uniform(0, 90), random.uniform(0, 90))
+    yield part(Torus(0.3 * size, 0.06 * size), 0.5, 0, 0.9, random.uniform(-30, 30), 90)
+    yield part(Cone(0.12 * size, 0.3 * size, 0.15 * size), -0.4, 0.2, 1.3)
+    for x, y, turn, tilt in random.uniform((-0.3, -0.3, 0, 0), (0.3, 0.3, 60, 60), (2, 4)):
+        yield part(Cylinder(THIN * size, 0.5 * size), x, y, 1.3, turn, tilt)
 
 
 def background(stage: SyntheticStage, distance: float) -> Iterator[Object]:
@@ -151,13 +151,15 @@ def carried(stage: SyntheticStage, turns: bool) -> SyntheticStage:
     """The stage before a background that goes with the camera. turns: exactly, as where an object turns before a still
     camera; else a board that is carried round, and sways."""
     random, middle = np.random.default_rng(0xB0A2), middle_of(stage)
-    numbered, first = {}, 0
+    numbered, first = dict[str, Any](), 0
     for split, cameras in stage.cameras.items():
         if cameras.image_index is None:
             cameras = replace(cameras, image_index=torch.arange(first, first + len(cameras)))
         numbered[split], first = cameras, first + len(cameras)
     every = {
-        int(old.image_index[i]): stage.cameras[split][i] for split, old in numbered.items() for i in range(len(old))
+        number: stage.cameras[split][i]
+        for split, cameras in numbered.items()
+        for i, number in enumerate(cameras.image_index.tolist())
     }
     offsets = dict(zip(every, random.normal(0, 0 if turns else SWAY, (len(every), 3)), strict=True))
     paints = [Material(textures(np.random.default_rng((k, 0xB0)), 0.2)) for k in range(5)]
@@ -169,9 +171,8 @@ def carried(stage: SyntheticStage, turns: bool) -> SyntheticStage:
         # Of the camera's frame: a wall behind the object, and things on shelves before it.
         things = [(Cuboid((BOARD_SIZE * away, BOARD_SIZE * away, 0.01)), np.array([0, 0, (1 + BOARD_WAY) * away]))]
         if turns:
-            places = ((-0.5, -0.3), (0.5, -0.1), (-0.4, 0.4), (0.45, 0.45))
-            side = 0.12 * away
-            things += [(Cuboid((side, side, side)), away * np.array([a, b, 1 + 0.8 * BOARD_WAY])) for a, b in places]
+            shelf, side = ((-0.5, -0.3), (0.5, -0.1), (-0.4, 0.4), (0.45, 0.45)), 0.12 * away
+            things += [(Cuboid((side, side, side)), away * np.array([a, b, 1 + 0.8 * BOARD_WAY])) for a, b in shelf]
         world, tilt = stage.world_of(camera), rotation_about((0, 1, 0), 20 * offsets[index][0])
         places = [eye + axes @ (place + away * offsets[index]) for _, place in things]
         added = tuple(
@@ -214,6 +215,7 @@ def disturbed_shot(shot: Shot, asked: Nuisances, number: int) -> Shot:
             shot = replace(shot, image=partial(photographed, shot.image, gains, way), identity=identity)
         if asked.poses:
             axis = shot.pose[:, :3] @ np.append(sphere_point(random.uniform(0, 2 * math.pi), 0.0)[:2], 0)
+            assert isinstance(shot.lens, Pinhole)
             angle = math.degrees(asked.poses * random.normal() / float(shot.lens.focal[0, 0]))
             turned = np.concatenate([rotation_about(tuple(axis), angle) @ shot.pose[:, :3], shot.pose[:, 3:]], 1)
             shot = replace(shot, pose=turned, about={TRUE_POSE: shot.pose} | shot.about)
@@ -312,11 +314,11 @@ def moved(capture: Capture, scale: float, offset: float) -> Capture:
         for shot in capture.shots
     ]
     assert capture.bounds is not None and capture.reach is not None and capture.near is not None
-    low, high = (tuple(scale * x + offset for x in corner) for corner in capture.bounds)
+    (a, b, c), (d, e, f) = ([scale * x + offset for x in corner] for corner in capture.bounds)
     return replace(
         capture,
         shots=shots,
-        bounds=(low, high),
+        bounds=((a, b, c), (d, e, f)),
         reach=scale * capture.reach,
         near=scale * capture.near,
         tracks=tuple(track.transformed(motion) for track in capture.tracks),

@@ -104,6 +104,8 @@ def fit(
     check_memory(type(method), method.frame, method.config, method.device, learning=True)
     with run.lock() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
         fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
+        if fresh:
+            method.check_data(data)
         display.begin(data, about_memory(method, data))
         compile_seconds = state.compile_seconds
         if rehearsal:

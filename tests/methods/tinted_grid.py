@@ -43,15 +43,10 @@ class TintedGrid(RayMethod):
         weight = torch.ones(len(seen)) if seen.alpha is None else seen.alpha
         return (weight[:, None] * seen.rgb).sum(0) / weight.sum().clamp_min(1e-6)
 
-    def given(self, *evidence, **controls):
-        told = super().given(**controls)  # a copy
-        for scene in evidence:
-            if not isinstance(scene, Scene):
-                return super().given(scene)  # which refuses it
-            told.frame = scene.frame
-            tint = self.tint_of(scene, torch.Generator().manual_seed(0))
-            told._buffers = self._buffers | {"tint": tint.to(self.device)}
-        return told
+    def take_evidence(self, evidence, controls):
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.tint = self.tint_of(scene, torch.Generator().manual_seed(0)).to(self.device)
 
     def batch(self, data, generator):
         _, scene = data.sample_member(generator)

@@ -68,15 +68,15 @@ class InstanceCodes(nn.Module):
         axes = self.axes
         return (code - self.average) @ axes.T / axes.square().sum(-1)
 
-    def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
+    def draw_code(self, generator: torch.Generator) -> Float[Tensor, " code"]:
         """Random code from the Gaussian fitted to the trained codes."""
         axes = self.axes
         return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
 
-    def code_of(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
-        """Code of a control's value: a member's, the average, a named one, or an interpolation of two, parsed by
-        `controls.blend`."""
-        known = {AVERAGE: self.average} | others
+    def code_of(self, value: str, found: Float[Tensor, "found code"] | None = None) -> Float[Tensor, " code"]:
+        """Code of a control's value: a member's, the average, that of evidence, or an interpolation of two, parsed by
+        `controls.blend`. found: the code of evidence; no row without one"""
+        known = {AVERAGE: self.average} | ({FOUND: found[0]} if found is not None and len(found) else {})
         first, second, share = blend(value)
         a, b = (known[x] if x in known else self.rows.detach()[int(x)] for x in (first, second))
         return torch.lerp(a, b, share)

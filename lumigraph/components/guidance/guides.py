@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...files.ranges import NonNegative
 from ...metrics import Score
 from .clip import Clip
 from .tokenizer import Tokenizer
@@ -18,12 +19,12 @@ Pictures = Float[Tensor, "picture 3 side side"]
 MIN_TIME = 0.02  # share of the noise schedule at which the least noise is drawn; higher: coarser advice
 MAX_TIME = 0.98  # share of the noise schedule at which the most noise is drawn
 
-GUIDANCE_SCALE = 100.0  # omega of eq. 4
-
 
 @dataclass(frozen=True)
 class DistillationNumbers:
     """A Config's numbers of score distillation (Poole 2022, section 3); CLIP uses none of them."""
+
+    guidance_scale: NonNegative = 100.0  # omega of eq. 4; higher: closer to the prompt, less varied, gaudier
 
 
 @runtime_checkable

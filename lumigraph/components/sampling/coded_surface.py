@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -46,8 +47,7 @@ class CodedSurface(SurfaceMethod):
         """Code of the current instance; that of a single shape without a choice."""
         if len(self._instances) < 2:
             return self.codes.average
-        others = {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
-        return self.codes.code_of(str(self.control("instance")), **others)
+        return self.codes.code_of(str(self.control("instance")), self.found.rows)
 
     @property
     def _instances(self) -> tuple[str, ...]:
@@ -58,25 +58,20 @@ class CodedSurface(SurfaceMethod):
         instance = [self.codes.control(len(self.found.rows) > 0)] if len(self._instances) > 1 else []
         return (*instance, *super().controls)
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The method with the code of a shape, fitted to its mesh, a scan or a picture."""
-        taken = [piece for piece in evidence if isinstance(piece, self.takes)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.takes)), **controls)
-        assert isinstance(told, CodedSurface)
-        for piece in taken[-1:]:
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Fit the code of a shape to its mesh, a scan or a picture."""
+        for piece in evidence[-1:]:
             if isinstance(piece, Shapes) and len(piece) != 1:
                 raise LumigraphError(f"{piece.source} holds {len(piece)} shapes, and one is completed; name its file")
             one: Any = piece.members[0] if isinstance(piece, Shapes) else piece
             if isinstance(one, Shape):
-                told.frame = one.frame
-            told._show(told.find(one))
-        return told
+                self.frame = one.frame
+            self._show(self.find(one))
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """The method with a generated shape: a code sampled from the Gaussian of the trained ones."""
-        told = super().given()
-        assert isinstance(told, CodedSurface)
-        told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
+        told: Any = self.given()
+        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:

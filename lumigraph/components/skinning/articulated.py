@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from ...camera import Camera
@@ -22,10 +23,8 @@ class Articulated(Method):
         first, _ = self.frame.times or (0.0, 0.0)
         return float(self.settings.get("time", first))
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The method in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
-        for a file without poses of this character."""
-        told = super().given(*evidence, **controls)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Check poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError for a file
+        without poses of this character."""
         if (path := str(controls.get("pose", CAPTURED))) not in (CAPTURED, AT_REST):
             clip_of(path, self.frame)
-        return told

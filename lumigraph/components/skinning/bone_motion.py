@@ -222,7 +222,7 @@ def skeleton_of(frame: Frame) -> Skeleton:
     if frame.skeleton is None:
         raise LumigraphError(
             "The scene has no skeleton, and this method moves a body by one; put bones.json beside the photographs, as "
-            "docs/datasets.md says"
+            "docs/people.md says"
         )
     return frame.skeleton
 

@@ -13,11 +13,11 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, normalize
+from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from ...datasets.scene import Photograph
 from ...method import Part
@@ -27,6 +27,7 @@ from .frames import DepthFrame
 from .trajectory import Pose, apply_twists, relative
 
 THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
+HOLE = 2  # pixels to measured depth, up to which a feature has that depth
 MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
@@ -49,16 +50,18 @@ class KeyframePlace:
     @torch.no_grad()
     def of(frame: DepthFrame) -> KeyframePlace:
         width, height = frame.size
-        picture = frame.rgb.view(height, width, 3)
-        seen = features(Photograph(frame.camera, picture))
-        depth = frame.depth.view(height, width)
-        places, inside = frame.camera.locate(seen.bearings)
+        camera, picture = frame.camera.to("cpu"), frame.rgb.view(height, width, 3).cpu()
+        seen = features(Photograph(camera, picture))
+        depth, known = (x.view(height, width).cpu() for x in (frame.depth, frame.measured))
+        near = -max_pool2d(torch.where(known, -depth, -torch.inf)[None], 2 * HOLE + 1, 1, HOLE)[0]
+        depth = torch.where(known, depth, torch.where(near.isfinite(), near, torch.nan))  # the nearest beside a hole
+        places, inside = camera.locate(seen.bearings)
         along = torch.where(inside, depth[places[:, 0], places[:, 1]], torch.nan)
         small = adaptive_avg_pool2d(picture.mean(-1)[None, None], THUMBNAIL).flatten()
         return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
 
 
-class Places:
+class FramePlaces:
     """Features of frames, found once and kept for keyframes and the latest frame."""
 
     def __init__(self) -> None:
@@ -94,7 +97,7 @@ class Loops(Part):
         self.unit = unit
         self.register_buffer("pairs", torch.zeros(0, 2, dtype=torch.int64))
         self.register_buffer("motions", torch.zeros(0, 3, 4))
-        self.places = Places()
+        self.places = FramePlaces()
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
         """Search the place of a new keyframe among older ones; True if found."""
@@ -118,11 +121,6 @@ class Loops(Part):
         return optimised(poses.double(), edges, motions.double(), self.unit).to(poses)
 
 
-def moved(pose: Pose, motion: Pose) -> Pose:
-    """Pose after a motion in its own frame."""
-    return torch.cat([pose[:, :3] @ motion[:, :3], (pose[:, :3] @ motion[:, 3] + pose[:, 3])[:, None]], -1)
-
-
 def motion(first: Pose, second: Pose) -> Pose:
     """Pose of the second in the frame of the first."""
     turn, shift = relative(first, second)
@@ -139,27 +137,22 @@ def motion_between(
     a, b = a[known].double(), b[known].double()
     if len(a) < MIN_INLIERS:
         return None
-    best = torch.zeros(len(a), dtype=torch.bool)
-    for _ in range(HYPOTHESES):
-        agree = agreeing(fitted(a, b, torch.randperm(len(a), generator=chance)[:3]), a, b, tolerance)
-        best = agree if agree.sum() > best.sum() else best
+    chosen = torch.rand(HYPOTHESES, len(a), generator=chance).topk(3).indices
+    tried = fitted(a[chosen], b[chosen])
+    agree = (b @ tried[:, :, :3].mT + tried[:, None, :, 3] - a).norm(dim=-1) < tolerance
+    best = agree[agree.sum(-1).argmax()]
     if int(best.sum()) < max(MIN_INLIERS, MIN_INLIER_SHARE * len(a)):
         return None
-    return fitted(a, b, best.nonzero()[:, 0]).float()
+    return fitted(a[best], b[best]).float()
 
 
-def agreeing(pose: Pose, a: Tensor, b: Tensor, tolerance: float) -> Bool[Tensor, " point"]:
-    return (b @ pose[:, :3].T + pose[:, 3] - a).norm(dim=-1) < tolerance
-
-
-def fitted(a: Float[Tensor, "point 3"], b: Float[Tensor, "point 3"], chosen: Int[Tensor, " chosen"]) -> Pose:
+def fitted(a: Float[Tensor, "*set point 3"], b: Float[Tensor, "*set point 3"]) -> Float[Tensor, "*set 3 4"]:
     """Rotation and shift from points b to points a by least squares (Umeyama 1991, without a scale)."""
-    a, b = a[chosen], b[chosen]
-    u, _, vt = torch.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
-    sign = torch.ones(3).to(a)
-    sign[2] = torch.linalg.det(u @ vt).sign()
-    turn = u * sign @ vt
-    return torch.cat([turn, (a.mean(0) - turn @ b.mean(0))[:, None]], -1)
+    (a, first), (b, second) = ((x - (middle := x.mean(-2, keepdim=True)), middle) for x in (a, b))
+    u, _, vt = torch.linalg.svd(a.mT @ b)
+    u = torch.cat([u[..., :2], u[..., 2:] * torch.linalg.det(u @ vt).sign()[..., None, None]], -1)
+    turn = u @ vt
+    return torch.cat([turn, (first - second @ turn.mT).mT], -1)
 
 
 def optimised(

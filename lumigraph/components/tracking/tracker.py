@@ -18,8 +18,8 @@ from ...files.ranges import Share, between
 from ...method import Part
 from .alignment import sensor_deviation
 from .frames import DepthFrame, Moment, order_of
-from .loops import TOLERANCE, Loops, Places, motion_between, moved
-from .trajectory import KNOWN, Pose, Trajectory, angle, relative
+from .loops import TOLERANCE, FramePlaces, Loops, motion_between
+from .trajectory import KNOWN, Pose, Trajectory, angle, moved, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
 MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
@@ -28,7 +28,8 @@ MAX_MOTION = 0.05, 0.053  # metres and radians a frame, above which a warning is
 RECENT_FRAMES, JUDGED_FRAMES = 4, 10  # whose motion decides about features, and about the warning
 AGREEMENT_POINTS, AGREEMENT_KEYFRAMES = 2000, 3  # pixels of a frame, and keyframes that they are compared with
 AGREEMENT_DEVIATIONS = 3.0  # of the sensor, within which depths agree
-MIN_AGREEMENT, MIN_COMMON = 0.65, 0.2  # share of common pixels that must agree, and of a frame's that must be common
+MIN_AGREEMENT, MIN_ON_KEYFRAME = 0.65, 0.35  # share of common points that must agree; of a keyframe's, which hides some
+MIN_COMMON = 0.2  # share of a frame's points in common with another, below which they are not compared
 ALIGNMENT_POINTS = 3000  # pixels of a frame that are aligned with the map's surface
 ALIGNMENT_ITERATIONS = 12  # Gauss-Newton steps of that
 
@@ -60,12 +61,14 @@ class Tracker(Part):
         super().__init__()
         self.numbers, self.unit, self.side = numbers, unit, side
         self.trajectory = Trajectory(image_count)
-        self.loops, self.places = Loops(unit) if numbers.track and numbers.close_loops else None, Places()
+        self.loops, self.places = Loops(unit) if numbers.track and numbers.close_loops else None, FramePlaces()
         if self.loops is not None:
             self.loops.places = self.places
         self.register_buffer("turn", torch.tensor(0))
         self.register_buffer("is_keyframe", torch.zeros(image_count, dtype=torch.bool))
-        self.common = 1.0  # share of the latest frame's pixels that a late keyframe shows too
+        self.overlap = 1.0  # share of the latest frame's points on the depth of a late keyframe
+        self._latest: DepthFrame | None = None
+        self._warned = False
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
@@ -85,7 +88,9 @@ class Tracker(Part):
         return Moment(data, self.frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
 
     def frame(self, data: Scene, index: int) -> DepthFrame:
-        """Load a frame, from memory for a stored keyframe."""
+        """Load a frame, from memory for a stored keyframe and the last known frame."""
+        if self._latest is not None and self._latest.index == index:
+            return self._latest
         if index not in self._held:
             like = next(iter(self._held.values()), None)
             return DepthFrame.of(data, index, self.turn.device, like, self.side)
@@ -148,10 +153,11 @@ class Tracker(Part):
         )
         for pose in chain(by_features, by_velocity) if fast else chain(by_velocity, by_features):
             share = explained(frame, pose)
-            if share > self.numbers.lost_share and self.agrees(frame, pose, data):
+            if share > self.numbers.lost_share and self.agrees(frame, pose, data, known[-1]):
                 trajectory.know(frame.index, pose, anchor)
+                self._latest = frame
                 self.places.keep([*self.keyframes, frame.index])
-                self.warn_of_speed(known)
+                self.warn_of_speed([*known, frame.index])
                 return share
         trajectory.lose(frame.index, last)
         return None
@@ -167,41 +173,52 @@ class Tracker(Part):
         for other in others():
             found = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
             if found is not None:
-                yield moved(self.trajectory.poses[other.index], found.to(self.trajectory.poses))
+                found = found.to(self.trajectory.poses)
+                yield moved(self.trajectory.poses[other.index], found[:, :3], found[:, 3])
 
     @torch.no_grad()
-    def agrees(self, frame: DepthFrame, pose: Pose, data: Scene) -> bool:
-        """True if measured points of a frame lie on the depth of a late keyframe, which no error of the map can spoil;
-        also where they share too little. Stores the share of common pixels."""
+    def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:
+        """True if measured points of a frame lie on the depth of the last known frame, and are not in front of that of
+        the keyframe with most points in common: no error of the map can spoil these. Also where they share too little.
+        Stores the largest share of points that lie on a late keyframe's depth."""
         pixels = frame.sample_pixels(AGREEMENT_POINTS, torch.Generator().manual_seed(frame.index), measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels]) @ pose[:, :3].T + pose[:, 3]
-        right, common = 0, MIN_COMMON * len(pixels)
-        for i in self.keyframes[-AGREEMENT_KEYFRAMES:]:
-            other = self.load_keyframe(data, i)
-            there = self.trajectory.poses[i]
+
+        def compared(other: DepthFrame) -> tuple[float, float, float]:
+            """Shares of the points that are in the picture, on its depth, and in front of that."""
+            there = self.trajectory.poses[other.index]
             local = (points - there[:, 3]) @ there[:, :3]
             places, inside = other.camera.locate(local)
-            depth, away = other.depth.view(other.size[::-1])[places[:, 0], places[:, 1]], local.norm(dim=-1)
-            seen = inside & depth.isfinite()
-            near = (depth - away).abs() < AGREEMENT_DEVIATIONS * self.unit * sensor_deviation(away / self.unit)
-            if int(seen.sum()) > common:
-                right, common = int((seen & near).sum()), int(seen.sum())
-        self.common = common / max(len(pixels), 1)
-        return right >= MIN_AGREEMENT * common or common <= MIN_COMMON * len(pixels)
+            away = local.norm(dim=-1)
+            ahead = other.depth.view(other.size[::-1])[places[:, 0], places[:, 1]] - away
+            seen, off = inside & ahead.isfinite(), AGREEMENT_DEVIATIONS * self.unit * sensor_deviation(away / self.unit)
+            shares = (x.float().mean() for x in (seen, seen & (ahead.abs() < off), seen & (ahead >= off)))
+            common, near, front = (float(x) for x in shares)
+            return common, near, front
+
+        if not len(pixels):
+            return True
+        common, near, _ = compared(self.frame(data, last))
+        keyframes = [compared(self.load_keyframe(data, i)) for i in self.keyframes[-AGREEMENT_KEYFRAMES:]]
+        self.overlap = max((x[1] for x in keyframes), default=1.0)
+        most, on, front = max(keyframes, default=(0.0, 0.0, 0.0))
+        steady = common < MIN_COMMON or near > MIN_AGREEMENT * common
+        return steady and (most < MIN_COMMON or (on > MIN_ON_KEYFRAME * most and on > MIN_AGREEMENT * (on + front)))
 
     def warn_of_speed(self, known: list[int]) -> None:
-        """Warn once, of the first frames' motion beyond the range of tracking."""
-        if len(known) != JUDGED_FRAMES:
+        """Warn once, of motion beyond the range of tracking in ten frames."""
+        shift, turn = self.trajectory.speed(known[-JUDGED_FRAMES:])
+        fast = shift > MAX_MOTION[0] * self.unit or turn > MAX_MOTION[1]
+        if self._warned or len(known) < JUDGED_FRAMES or not fast:
             return
-        shift, turn = self.trajectory.speed(known)
-        if shift > MAX_MOTION[0] * self.unit or turn > MAX_MOTION[1]:
-            warnings.warn(
-                f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame "
-                f"(median of the first {len(known)}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
-                f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
-                LumigraphWarning,
-                stacklevel=2,
-            )
+        self._warned = True
+        warnings.warn(
+            f"The camera moves by {100 * shift / self.unit:.2g} cm and {math.degrees(turn):.2g} degrees a frame "
+            f"(median of {JUDGED_FRAMES}), where tracking is made for {100 * MAX_MOTION[0]:.0f} cm and "
+            f"{math.degrees(MAX_MOTION[1]):.0f} degrees; record more frames, or move more slowly, if some are lost",
+            LumigraphWarning,
+            stacklevel=2,
+        )
 
     def plausible(self, last: Pose, pose: Pose, frames: int) -> bool:
         """True for a motion plausible for a hand-held camera within so many frames."""

@@ -58,8 +58,7 @@ class Trajectory(Part):
         last = self.poses[before[0]]
         if len(before) < 2 or (self.state[before[:2]] != KNOWN).any():
             return last.clone()
-        turn, shift = relative(self.poses[before[1]], last)
-        return torch.cat([last[:, :3] @ turn, (last[:, :3] @ shift + last[:, 3])[:, None]], -1)
+        return moved(last, *relative(self.poses[before[1]], last))
 
     def speed(self, images: list[int]) -> tuple[float, float]:
         """Median motion from each of these frames to the next one: scene units, radians; infinity for no two frames."""
@@ -77,9 +76,7 @@ class Trajectory(Part):
         """Set poses of keyframes, and move the frames anchored to them."""
         for keyframe, pose in zip(keyframes, rigid(poses), strict=True):
             beside = self.anchor == keyframe
-            turn, shift = relative(self.poses[keyframe], self.poses[beside])
-            there = torch.cat([pose[:, :3] @ turn, (shift @ pose[:, :3].T + pose[:, 3])[:, :, None]], -1)
-            self.poses[beside] = rigid(there)
+            self.poses[beside] = rigid(moved(pose, *relative(self.poses[keyframe], self.poses[beside])))
             self.poses[keyframe] = pose
 
     @torch.no_grad()
@@ -97,6 +94,11 @@ def relative(first: Pose, second: Float[Tensor, "*frame 3 4"]) -> tuple[Tensor, 
     """Rotation and shift of poses in the frame of the first: first^-1 second."""
     back = first[:, :3].T
     return back @ second[..., :3], (second[..., 3] - first[:, 3]) @ back.T
+
+
+def moved(pose: Pose, turn: Float[Tensor, "*frame 3 3"], shift: Float[Tensor, "*frame 3"]) -> Tensor:
+    """Poses after a rotation and a shift in the frame of the first; the inverse of `relative`."""
+    return torch.cat([pose[:, :3] @ turn, (shift @ pose[:, :3].T + pose[:, 3])[..., None]], -1)
 
 
 def angle(turn: Float[Tensor, "*pose 3 3"]) -> Float[Tensor, "*pose"]:

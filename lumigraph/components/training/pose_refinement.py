@@ -114,7 +114,7 @@ class PoseRefinement(Part):
         omega, shift = self.moves[rays.image_index].split(3, -1)
         return replace(rays, origins=rays.origins + shift, directions=rotated(rays.directions, omega))
 
-    def moved(self, rays: Rays) -> Rays:
+    def refine_rays(self, rays: Rays) -> Rays:
         return self(rays)
 
     @torch.no_grad()

@@ -123,7 +123,7 @@ class BlockNeRF(FieldMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The error of every pass's colours, and of the visibility network along the last pass's rays."""
-        c, generator, rays = self.config, self.random(step), self.moved(batch.rays)
+        c, generator, rays = self.config, self.random(step), self.refine_rays(batch.rays)
         assert rays.image_index is not None
         codes = self.codes(rays.image_index)
         background = backdrop(batch, self.background, generator, opaque=self.frame.is_open)

@@ -442,10 +442,9 @@ class EG3D(Method):
             *((Control("picture", FINAL, choices=(FINAL, VOLUME), about=picture),) if self.generator.upscaling else ()),
         )
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A generated object, from a random code."""
-        told = self.given()
-        assert isinstance(told, EG3D)
+        told: Any = self.given()
         told._show(self._styles_of([seed]))
         return told
 
@@ -481,16 +480,12 @@ class EG3D(Method):
         c = replace(self.config, pictures_per_step=len(scene.splits["train"]))
         return self.further_bytes(self.frame, c, True)
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The generator inverted for a scene's photographs: a style, and a generator fine-tuned to it."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, EG3D)
-        told._shown = None
-        for scene in scenes[-1:]:
-            told.frame = replace(bounded(scene).frame, has_alpha=self.frame.has_alpha)
-            told._find(scene)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Invert the generator for a scene's photographs: a style, and a generator fine-tuned to it."""
+        self._shown = None
+        for scene in evidence[-1:]:
+            self.frame = replace(bounded(scene).frame, has_alpha=self.frame.has_alpha)
+            self._find(scene)
 
     def _show(self, style: Style) -> None:
         self.found, self._shown = Kept(style), None

@@ -16,12 +16,13 @@ from torch.nn.functional import cross_entropy, log_softmax
 
 from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.cloud import Cloud
-from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...components.instances import ALONE, LABELS, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...components.training.row_optimizers import exchange
-from ...datasets.scene import Scene
+from ...datasets.scene import Photograph, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import LearningRate, Share, Steps, between
 from ...gaussians import Gaussians, joined
+from ...gaussians.splatting import Splatted, splat, view_of
 from ...method.controls import Configured, Control
 
 CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
@@ -67,8 +68,10 @@ class Identities(Addition):
         self.register_buffer("places", torch.zeros(count, 3))
         self.register_buffer("seen", torch.zeros(n.instances, dtype=torch.bool))
         self.optimizer: torch.optim.Adam | None = None
+        self.data: Scene | None = None  # of the last step
 
     def layers(self, data: Scene) -> tuple[str, ...]:
+        self.data = data
         return layers_of(data)
 
     # Following the cloud
@@ -113,18 +116,33 @@ class Identities(Addition):
         if step.progress < n.identity_start or step.drawn % n.identity_interval:
             return
         self.places = step.learnt.means.detach().clone()
-        labels, known = labels_of(step.photograph.extra, step.photograph.alpha, n.instances)
+        photograph, picture = step.photograph, step.picture
+        labels, known = labels_of(photograph.extra, photograph.alpha, n.instances)
+        if not known.any() and (other := self.labelled(step)) is not None:
+            with torch.no_grad():
+                picture = splat(step.whole, view_of(step.views.refined(other.camera), step.views.near_plane), bands=1)
+            labels, known = labels_of(other.extra, other.alpha, n.instances)
         self.seen[labels[labels >= 0].unique()] = True
-        logits = self.classifier(self.rendered(step))
+        logits = self.classifier(self.rendered(picture))
         target = torch.where(labels >= 0, labels, n.instances)
         if known.any():
             step.terms["identity"] = IDENTITY_WEIGHT * cross_entropy(logits[known], target[known])
         if len(self.codes) > NEIGHBOURS:
             step.terms["neighbours"] = NEIGHBOUR_WEIGHT * self.disagreement(step.chance)
 
-    def rendered(self, step: Step) -> Float[Tensor, "height width code"]:
+    def labelled(self, step: Step) -> Photograph | None:
+        """A random labelled photograph, for a step on one that has no labels; None without any."""
+        if self.data is None or LABELS not in self.data.layers:
+            return None
+        planes = self.data.layers[LABELS].planes
+        some = [i for i in self.data.splits["train"].tolist() if planes[i] is not None]
+        if not some:
+            return None
+        found = self.data.photograph(some[int(torch.randint(len(some), (), generator=step.chance))], (LABELS,))
+        return found.reduced(max(1, found.rgb.shape[0] // step.rgb.shape[0])).to(step.rgb.device)
+
+    def rendered(self, picture: Splatted) -> Float[Tensor, "height width code"]:
         """Codes, composited as colours are; gradients reach the codes alone."""
-        picture = step.picture
         footprints = picture.centres.detach(), picture.conics.detach(), picture.opacities.detach()
         fixed = replace(picture, centres=footprints[0], conics=footprints[1], opacities=footprints[2])
         found = []

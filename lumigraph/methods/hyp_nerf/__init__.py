@@ -250,7 +250,7 @@ class HypNeRF(RayMethod):
         terms = {"colour": residual.square().mean()}
         if self.config.empty_points and self.config.empty_weight:
             points = 2 * torch.rand(self.config.empty_points, 3, generator=generator).to(self.device) - 1
-            density = instance.density(points[~held(cells, points)])
+            density = instance.density(points[~in_cells(cells, points)])
             terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY_LENGTH * density).sum() / len(points)
         return terms
 
@@ -318,17 +318,13 @@ class HypNeRF(RayMethod):
     def _told(self) -> HashInstance:
         """Field of the code in the control `instance`; for a code fitted to evidence, with its fine-tuned tensors."""
         value = str(self.control("instance"))
-        (instance,) = self._made(self.codes.code_of(value, **self._others)[None])
+        (instance,) = self._made(self.codes.code_of(value, self.found.rows)[None])
         first, second, share = blend(value)
         weight = (1 - share) * (first == FOUND) + share * (second == FOUND)
         if not weight or not self.tuned:
             return instance
         tensors = [x + weight * change for x, change in zip(instance.tensors, self.tuned.changes, strict=True)]
         return HashInstance(self.shape, tensors)
-
-    @property
-    def _others(self) -> dict[str, Tensor]:
-        return {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
 
     @property
     def controls(self) -> tuple[Control, ...]:
@@ -344,24 +340,18 @@ class HypNeRF(RayMethod):
         """Bytes of the photographs' sampled pixels, as rays."""
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The field fitted to an object's photographs: first its code, then its tensors (section 3.3); or another
-        trained one."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, HypNeRF)
-        told._shown = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("instance", None)
-            told._find(scene)
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Fit the field to an object's photographs: first its code, then its tensors (section 3.3)."""
+        self._shown = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("instance", None)
+            self._find(scene)
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A random object: a code from the Gaussian fitted to the trained codes."""
-        told = super().given()
-        assert isinstance(told, HypNeRF)
-        told.found, told._shown = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None]), None
+        told: Any = self.given()
+        told.found, told._shown = Kept(self.codes.draw_code(torch.Generator().manual_seed(seed))[None]), None
         told.tuned = untuned(self.shape)
         told.settings.pop("instance", None)
         return told
@@ -467,7 +457,7 @@ def untuned(shape: HashShape) -> TensorChanges:
     return TensorChanges(torch.empty(0, *sizes) for sizes in shape.tensors)
 
 
-def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+def in_cells(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
     """Mask of the points of [-1, 1]^3 in possibly occupied cells."""
     x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
     return cells.occupied[0, x, y, z]

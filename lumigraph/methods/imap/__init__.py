@@ -36,7 +36,7 @@ MIN_LOSS = 1e-3  # added to losses, so that each region and keyframe can be draw
 SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is explained
 SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
-MIN_OVERLAP = 0.6  # share of pixels in common with a keyframe, below which a frame becomes one, for matched features
+MIN_OVERLAP = 0.5  # share of points on a keyframe's depth, below which a frame becomes one: features match less
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
 TRACKING_RATE = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 TRACKING_PIXELS = 200  # pixels of each of these descents, section 3.4
@@ -74,8 +74,6 @@ class LossNumbers:
     smooth_weight: NonNegative = 0.0  # weight of differences between neighbours in the table, with --field hash
 
 
-FREQUENCY_DEVIATION = 25.0  # sigma of the Fourier features, section 3.1
-
 LAYERS = 4  # hidden layers of the network, section 3.1
 
 
@@ -92,6 +90,7 @@ class Config:
     field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
     colour_layers: Layers = 2  # hidden layers of the table's colour network; more cost time
     hidden_width: Width = 256  # channels of a hidden layer, section 3.1; wider holds more detail, and costs time
+    frequency_deviation: Positive = 25.0  # sigma of the Fourier features, section 3.1; higher holds finer detail
     truncation: Positive = 0.1  # metres at which the distance is truncated, with --field hash
     sharpness: Positive = 10.0  # steepness of density at a surface, per truncation, with --field hash
     learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
@@ -124,7 +123,7 @@ class IMap(FieldMethod):
                     c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness, c.colour_layers
                 )
             else:
-                self.network = MapNetwork(LAYERS, c.hidden_width, FREQUENCY_ROWS, FREQUENCY_DEVIATION)
+                self.network = MapNetwork(LAYERS, c.hidden_width, FREQUENCY_ROWS, c.frequency_deviation)
         self.sampler = MapSampler(space, c.rays, c.truncation * self.unit if hashed else None)
         self.tracker = Tracker(frame.image_count, c.tracking, self.unit)
         self.snapshot = copy.deepcopy(self.network).requires_grad_(False)
@@ -177,7 +176,7 @@ class IMap(FieldMethod):
                 self.figures["explained"] = share
             if learns and (
                 not self.tracker.keyframes
-                or self.tracker.common < MIN_OVERLAP
+                or self.tracker.overlap < MIN_OVERLAP
                 or self.explained(self.snapshot, frame, self.tracker.trajectory.poses[frame.index], chance)
                 < c.keyframe_share
             ):

@@ -114,12 +114,14 @@ class MeshFit(Method):
         super().compile_begin()
         remeshed(sphere(self.frame, 8), 8)
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+    def check_data(self, data: Scene) -> None:
         if data.frame.is_open:
             raise LumigraphError(
                 "mesh-fit fits one closed surface, and this capture goes on to the horizon; train a radiance field, "
                 "or cut the photographs out and give them an alpha channel"
             )
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         if self.config.start == "hull" and data.images.has_alpha:
             self._begin_with(hull(data, self.config.first_cells))

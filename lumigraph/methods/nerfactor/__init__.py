@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
@@ -480,19 +480,13 @@ class NeRFactor(FieldMethod):
             *CONTROLS,
         )
 
-    def given(self, *evidence: Any, **controls: Value) -> NeRFactor:
-        """Relit by an `EnvironmentLight`, or by controls."""
-        lights = [piece for piece in evidence if isinstance(piece, EnvironmentLight)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, EnvironmentLight)), **controls)
-        assert isinstance(told, NeRFactor)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Relight by an `EnvironmentLight`, or by controls."""
         named = str(controls.get("light", ""))
         if named.lower().endswith(SUFFIXES):
-            lights.append(EnvironmentLight.open(named))
-        if lights:
-            told._told = lights[-1]
-        elif named:
-            told._told = None
-        return told
+            self._told = EnvironmentLight.open(named)
+        elif evidence or named:
+            self._told = evidence[-1] if evidence else None
 
     @torch.no_grad()
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:

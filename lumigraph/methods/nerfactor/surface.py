@@ -22,7 +22,6 @@ from .loops import transmittance
 
 MARGIN = 2  # cells around the box of interest
 POINTS_PER_CHUNK = 1 << 17  # at which density is evaluated together
-SLAB = 1 << 16  # point-direction pairs that are marched together with tensors
 STEP = 0.7  # of a cell, along rays to lights
 STOP = 6.0  # optical thickness at which nothing is left
 LIFT = 2.0  # cells above a surface at which rays to lights begin

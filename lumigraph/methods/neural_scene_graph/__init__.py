@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -256,7 +257,7 @@ class NeuralSceneGraph(FieldMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Errors of composited colours, and the prior of codes (eq. 10)."""
         c, generator = self.config, self.random(step)
-        rays = self.moved(batch.rays)
+        rays = self.refine_rays(batch.rays)
         passes, terms = self.learn_along(rays, generator)
         instances = self.instance_looks(rays, generator)
         background = backdrop(batch, self.background, generator, opaque=self.sampler.is_open)
@@ -290,18 +291,14 @@ class NeuralSceneGraph(FieldMethod):
         times = (moment(self.frame.times),) if self.frame.times else ()
         return *super().controls, *times, *own
 
-    def given(self, *evidence: Any, **controls: Value) -> NeuralSceneGraph:
-        """The same graph after edits, with controls, or with a scene's new instances added: only their codes are fitted
-        to its photographs."""
-        told = super().given(*(x for x in evidence if not isinstance(x, Scene | TrackEdits)), **controls)
-        assert isinstance(told, NeuralSceneGraph)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Apply edits, or add a scene's new instances: only their codes are fitted to its photographs."""
         for piece in evidence:
             if isinstance(piece, TrackEdits):
-                told.edits = TrackEdits((*told.edits.edits, *piece.edits))
-            elif isinstance(piece, Scene):
-                told.found = found_in(told, piece)
-        told.arrange()
-        return told
+                self.edits = TrackEdits((*self.edits.edits, *piece.edits))
+            else:
+                self.found = found_in(self, piece)
+        self.arrange()
 
 
 def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ...], Float[Tensor, "track code"]]:
@@ -325,7 +322,7 @@ def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ..
     kinds = [track.category for track in method.frame.tracks]
     means = [method.codes.detach()[[i for i, kind in enumerate(kinds) if kind == x.category]].mean(0) for x in new]
     codes = torch.stack(means).requires_grad_()
-    student = method.given()
+    student: Any = method.given()
     student.settings = {}
     student.edits = TrackEdits(())
     student.found = (*method.found[0], *new), torch.cat([method.found[1].to(codes.device), codes])

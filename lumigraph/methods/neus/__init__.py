@@ -25,7 +25,7 @@ from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, 
 from ...method import FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
-from .fields import COLOUR_DEPTH, HashDistance, NetworkDistance, NeuSField
+from .fields import COLOUR_DEPTH, DistanceNumbers, HashDistance, NetworkDistance, NeuSField
 from .sampler import NETWORK_CHUNK, TABLE_CHUNK, SectionSampler
 
 HULL_CELLS = 64  # per axis, of the visual hull that the first sphere is found from
@@ -38,14 +38,12 @@ MIN_OPACITY = 1e-3  # opacities of the mask term stay so far from 0 and 1, where
 EIKONAL_WEIGHT = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
 MASK_WEIGHT = 0.1  # beta, weight of the mask term, eq. 18, where photographs have alpha
 
-DEPTH = 8  # hidden layers of the distance network, section E.1
-POSITION_FREQUENCIES = 6  # octaves of positions for the distance, section E.1
-
 
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers, from section E and the release (confs/wmask.conf, womask.conf)."""
 
+    network: DistanceNumbers = DistanceNumbers()
     table: HashNumbers = HashNumbers()
     rays: RayNumbers = RayNumbers(coarse_samples=64, fine_samples=64, rays_per_step=512)
     mask: MaskNumbers = MaskNumbers()
@@ -95,7 +93,7 @@ class NeuS(FieldMethod):
                 shape: Any = HashDistance(c.table, c.hidden_width, self.bands.weights if self.bands else None)
                 outside: Any = HashField(c.table, c.hidden_width, around, frame.reach) if around else None
             else:
-                shape = NetworkDistance(c.hidden_width, DEPTH, POSITION_FREQUENCIES)
+                shape = NetworkDistance(c.network, c.hidden_width)
                 outside = CoordinateField(NetworkNumbers(), c.hidden_width, around) if around else None
             margin = 2 * math.sqrt(3) / max(c.mask.occupancy_resolution, 1)
             self.network = NeuSField(shape, frame.bounds, outside, margin, self.slopes)
@@ -133,7 +131,8 @@ class NeuS(FieldMethod):
             return 0
         if config.field == "hash":
             return config.table.activation_bytes(TAPS * config.samples_per_step, config.hidden_width)
-        return 8 * config.rays.samples_per_step * config.hidden_width * (DEPTH + COLOUR_DEPTH)
+        n = config.network
+        return 8 * config.rays.samples_per_step * config.hidden_width * (n.depth + COLOUR_DEPTH)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Signed distance to the nearest surface in scene units, negative inside."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from ... import kernels
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import HashField, HashNumbers, Joining
 from ...components.fields.spaces import Box
+from ...files.ranges import Depth, Octaves
 from ...geometry import Vector
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
@@ -28,6 +30,14 @@ TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.
 SKIP_LAYER = 4  # layer whose activation the input is concatenated to again
 COLOUR_DEPTH = 4  # hidden layers of the colour network
 DIRECTION_FREQUENCIES = 4  # octaves of directions for colour
+
+
+@dataclass(frozen=True)
+class DistanceNumbers:
+    """A Config's numbers of the distance and colour networks; the paper's (Wang 2021, section E.1)."""
+
+    depth: Depth = 8  # hidden layers of the distance network; more hold more detail, and cost time
+    position_frequencies: Octaves = 6  # octaves of positions for the distance; more give finer detail, and noise
 
 
 class Surface(NamedTuple):
@@ -89,15 +99,16 @@ class NetworkDistance(DistanceField):
     each layer keeps the norm of its input on average, and the last one takes the mean of its inputs.
     """
 
-    def __init__(self, width: int, depth: int, position_frequencies: int):
+    def __init__(self, numbers: DistanceNumbers, width: int):
         super().__init__()
-        self.encode_position = FrequencyEncoding(3, position_frequencies, base=1.0)
+        n = numbers
+        self.encode_position = FrequencyEncoding(3, n.position_frequencies, base=1.0)
         self.encode_direction = FrequencyEncoding(3, DIRECTION_FREQUENCIES, base=1.0)
-        inputs, self.skip = self.encode_position.width, min(SKIP_LAYER, depth - 1)
+        inputs, self.skip = self.encode_position.width, min(SKIP_LAYER, n.depth - 1)
         narrow = max(width - inputs, 1)  # the layer before the skip: with the input again it has the usual width
         self.activation = nn.Softplus(SOFTPLUS_BETA)
         layers = []
-        for i in range(depth):
+        for i in range(n.depth):
             before = inputs if i == 0 else narrow + inputs if i == self.skip else width
             waves = inputs - 3 if i in (0, self.skip) else 0
             layers.append(geometric(nn.Linear(before, narrow if i == self.skip - 1 else width), waves))

@@ -113,8 +113,10 @@ class ObjectNeRF(FieldMethod):
 
     # Learning
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+    def check_data(self, data: Scene) -> None:
         check_labels(data)
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         self.codes.begin(torch.arange(self.config.instances), CODE_DEVIATION, self.random(1))
 

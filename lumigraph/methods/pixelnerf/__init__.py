@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -36,7 +37,7 @@ from ...files.ranges import (
     Width,
     between,
 )
-from ...method import Method, RayMethod
+from ...method import RayMethod
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.views import spread_out
@@ -50,7 +51,6 @@ DEPTH_DEVIATION = 0.01  # standard deviation of these, as a share of the ray's l
 BLOCKS = 5  # residual blocks of the network, appendix B.1
 VIEW_BLOCKS = 3  # blocks of these before the mean over views, appendix B.1
 TARGETS = 4  # photographs of a member that a step's rays come from
-FINAL_LEARNING_RATE = 1e-4  # learning rate at the end of the budget, reached exponentially
 BFLOAT16 = True  # multiply in bfloat16 where the processor is fast at it
 
 
@@ -76,6 +76,7 @@ class Config:
     rays_per_member: BatchSize = 128  # rays of each scene in a step; more reduce noise, and cost time
     boxed: Share = 0.75  # share of the budget in which rays go through boxes around opaque pixels, appendix B.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     empty_threshold: Share = 0.0  # coarse opacity below which a ray has no fine pass; higher is faster
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -150,7 +151,7 @@ class PixelNeRF(RayMethod):
         return Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16,
             density="softplus", density_scale=5.0, source_views=2,
             coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96,
-            learning_rate=1e-2)  # fmt: skip
+            learning_rate=1e-2, final_learning_rate=3e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -220,19 +221,15 @@ class PixelNeRF(RayMethod):
     def evidence_views(self) -> int | None:
         return int(float(self.control("views"))) if self.controls else 1
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """A field of a scene, conditioned on its training photographs; or the same one, on fewer of them."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, PixelNeRF)
-        told._sources = None
-        for scene in scenes[-1:]:
-            told.frame = scene.frame
-            told.settings.pop("views", None)
-            told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Condition the field on a scene's training photographs, or on fewer of them."""
+        self._sources = None
+        for scene in evidence[-1:]:
+            self.frame = scene.frame
+            self.settings.pop("views", None)
+            self.kept = self._keeping(scene, len(scene.splits["train"])).to(self.device)
             with torch.no_grad():
-                told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
-        return told
+                self.kept.found.rows = self._features(self.kept.pictures()).flatten(0, 2)
 
     def evidence_bytes(self, scene: Scene) -> int:
         """Bytes of the photographs and their features."""

@@ -181,7 +181,7 @@ class RegNeRF(FieldMethod):
 
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         c, generator, unseen = self.config, self.random(step), batch.unseen
-        rays = self.moved(batch.rays)
+        rays = self.refine_rays(batch.rays)
         rays = rays if unseen is None else joined(rays, unseen)
         passes, terms = self.learn_along(rays, generator)
         opaque = self.sampler.is_open if self.by_table else c.random_backdrop and self.frame.is_open

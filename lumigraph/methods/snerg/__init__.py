@@ -49,7 +49,6 @@ from ...volume import composite, weights_of
 from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
 
-VIEW_WIDTH = 16  # channels of the view-dependence network, section 4.2
 POSITION_FREQUENCIES = 10  # octaves of positions of the network
 
 
@@ -62,6 +61,7 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     field: Literal["hash", "network"] = "network"  # field to bake: the paper's network, or a faster hash table
+    view_width: Width = 16  # channels of the view-dependence network, section 4.2; wider is slower in a browser
     sparsity_weight: NonNegative = 1e-7  # lambda_s of eq. 8: 1e-4 over a ray's 1024 samples; higher: emptier voxels
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # share of the budget ahead of baking
     voxel_share: Share = 0.0  # share of the rest in which voxels learn too, then the small network alone; 0: none
@@ -140,7 +140,7 @@ class SNeRG(FieldMethod):
             else:
                 layers = c.hidden_layers, c.hidden_width, SKIP_LAYER
                 self.network = NetworkDeferred(POSITION_FREQUENCIES, *layers, space)
-            self.view = ViewDependence(VIEW_WIDTH)
+            self.view = ViewDependence(c.view_width)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         contracted = contraction_of(frame) if c.whole and frame.is_open else None
         self.voxel_space = contracted or Box(frame.bounds, frame.near)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,7 +16,7 @@ from ...budget import Effort, Efforts
 from ...camera.rays import Rays, Rendering
 from ...color.blending import before
 from ...components.fields.appearance import fitted
-from ...components.fields.instance_codes import FOUND, InstanceCodes
+from ...components.fields.instance_codes import InstanceCodes
 from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
@@ -218,15 +219,11 @@ class SRN(RayMethod):
     @property
     def code(self) -> Float[Tensor, " code"]:
         """Code of the current scene."""
-        return self.codes.code_of(str(self.control("instance")), **self._others)
-
-    @property
-    def _others(self) -> dict[str, Tensor]:
-        return {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
+        return self.codes.code_of(str(self.control("instance")), self.found.rows)
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        return (self.codes.control(bool(self._others)),)
+        return (self.codes.control(len(self.found.rows) > 0),)
 
     @property
     def evidence_views(self) -> int | None:
@@ -236,22 +233,17 @@ class SRN(RayMethod):
         """Pixels as rays."""
         return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same weights with the code of a scene's photographs; or another trained one."""
-        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
-        assert isinstance(told, SRN)
-        told._shown = None
-        for scene in scenes[-1:]:
-            told.frame = replace(scene.frame, has_alpha=self.frame.has_alpha)
-            told._show(told._code_of(scene))
-        return told
+    def take_evidence(self, evidence: Sequence[Any], controls: dict[str, Value]) -> None:
+        """Fit the code of a scene to its photographs."""
+        self._shown = None
+        for scene in evidence[-1:]:
+            self.frame = replace(scene.frame, has_alpha=self.frame.has_alpha)
+            self._show(self._code_of(scene))
 
-    def drawn(self, seed: int) -> Method:
+    def draw_object(self, seed: int) -> Method:
         """A random scene: a code from the Gaussian fitted to the trained codes."""
-        told = super().given()
-        assert isinstance(told, SRN)
-        told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
+        told: Any = self.given()
+        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:

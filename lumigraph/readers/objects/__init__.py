@@ -78,7 +78,7 @@ def refined(
 ) -> Float[np.ndarray, "height width"]:
     """The mask at a photograph's size, refined to its edges; in [0, 1]."""
     height, width = rgb.shape[:2]
-    small = Image.fromarray(found.inside[index][found.views[index].patches])
+    small = Image.fromarray(found.masks[index])
     rough = np.asarray(small.convert("L").resize((width, height), Image.Resampling.BILINEAR)) / 255
     soft = guided(rgb.mean(-1), rough, max(1, round(OUTLINE_RADIUS * max(width, height))))
     return (OUTLINE_GAIN * (soft - 0.5) + 0.5).clip(0, 1)

@@ -8,6 +8,7 @@ object from below.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from torch import Tensor
 
 from ...errors import LumigraphError
+from ...geometry import evenly
 from ...system.progress import track
 from .view import GRID_SIDE, ObjectView, Region, find_region
 
@@ -31,12 +33,16 @@ SHADOW_BRIGHTNESS = 0.35  # of the darkest shadow
 PLAIN_SHARE, PLAIN_DISTANCE = 0.8, 3.0  # share of a plain backdrop within this CIELAB distance of its median
 BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body covers
 MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
-MAX_STILL_DEVIATION = 8.0  # CIELAB units by which photographs may differ at a pixel that shows a still background
+MAX_REST_DEVIATION = 4.0  # CIELAB units by which photographs may differ at a pixel that shows a background at rest
 COLOUR_RANGE = 50.0  # CIELAB units along each axis, over which an object's colours spread
-MIN_STILL_VIEWS = 8  # photographs that a still background is found in
+MIN_REST_VIEWS, MAX_REST_VIEWS = 3, 24  # photographs that show it at a pixel; photographs that are compared
+MIN_REST_SHARE = 0.8  # share of the background's pixels that agree with it
+SURE_REST = 3.0  # log-likelihood ratio of pixels that are background wherever they lie
+REST_PIXELS = 3  # by which an outline may grow
 MIN_CELLS = 20  # of a body
 MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
+Mask = Bool[np.ndarray, "height width"]
 COMPONENTS = 10  # Gaussians of a mixture
 MIN_PIXELS = 50  # per Gaussian
 MIN_DEVIATION = 2.0  # units of CIELAB by which colours of one surface differ at the least
@@ -81,7 +87,7 @@ class Segmentation:
     """Result of a segmentation.
 
     views:    the photographs, small
-    inside:   superpixels of each that belong to the object
+    inside:   superpixels of each that belong to the object;  masks: its pixels
     body:     cells of space that the object fills
     overlaps: intersection over union of each cut and the body's silhouette
     distinct: accuracy of classifying superpixels by colour alone; 0.5 is chance
@@ -89,6 +95,7 @@ class Segmentation:
 
     views: list[ObjectView]
     inside: list[Patches]
+    masks: list[Mask]
     body: Float[Tensor, "cell 3"]
     region: Region
     overlaps: Float[np.ndarray, " view"]
@@ -111,38 +118,62 @@ def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None
         raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
     shown = [behind(region, view) for view in views]
-    still, body = still_evidence(views), first_guess(region, points)
+    body = first_guess(region, points)
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
     inside = [share > 0.5 for share in shares]
     strength = 0.0  # at first the body is a guess, and only colours speak
     for slack in track(MAX_DISAGREEMENTS, "Cutting the object out", len(MAX_DISAGREEMENTS)):
         own, around = learn_colours(views, inside)
+        resting = at_rest(views, [own[view.patches] for view, own in zip(views, inside, strict=True)])
         inside = []
-        for view, share, may, unmoved in zip(views, shares, allowed, still, strict=True):
-            colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours) + unmoved
+        for view, share, may, still in zip(views, shares, allowed, resting, strict=True):
+            colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours) + view.mean(still)
             costs = colour.clip(-MAX_COLOUR_LOG_LIKELIHOOD, MAX_COLOUR_LOG_LIKELIHOOD) - strength * (2 * share - 1)
             inside.append(cut(view, np.where(may, costs, MAX_COST)))
         body = carved(region, shown, inside, slack)
         shares = [view.mean(view.shadow(body, region.size)) for view in views]
         strength = BODY_LOG_LIKELIHOOD
     overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
-    return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
+    told_apart = distinctness(views, inside, own, around)
+    return Segmentation(list(views), inside, outlined(views, inside), body, region, overlaps, told_apart)
 
 
-def still_evidence(views: Sequence[ObjectView]) -> list[Float[np.ndarray, " patch"]]:
-    """Log-likelihood ratios of superpixels for a background at rest in the picture, behind a subject that turns, or
-    plain: ln N(colour; median of all views, their deviation) + 3 ln COLOUR_RANGE, and 0 where views differ at a pixel.
+def at_rest(views: Sequence[ObjectView], masks: Sequence[Mask]) -> list[Float[np.ndarray, "height width"]]:
+    """Log-likelihood ratios of pixels for a background at rest in the picture: plain, or behind a subject that turns.
+
+    ln N(colour; median, deviation) + 3 ln COLOUR_RANGE, of the views that show background at a pixel. 0 where they are
+    few or differ, and everywhere where much of the background disagrees, or photographs differ in size.
+    masks: of the object so far
     """
-    if len({view.lab.shape for view in views}) > 1 or len(views) < MIN_STILL_VIEWS:
-        return [np.zeros(len(view.sizes)) for view in views]
-    stack = np.stack([view.lab for view in views]).astype(np.float32)
-    middle = np.median(stack, 0)
-    away = np.linalg.norm(stack - middle, axis=-1)
-    deviation = np.maximum(np.median(away, 0), MIN_DEVIATION)
-    ratio = 3 * np.log(COLOUR_RANGE / (deviation * (2 * np.pi) ** 0.5)) - 0.5 * (away / deviation) ** 2
-    limit = MAX_COLOUR_LOG_LIKELIHOOD
-    ratio = np.where(deviation < MAX_STILL_DEVIATION, ratio.clip(-limit, limit), 0.0)
-    return [view.mean(own) for view, own in zip(views, ratio, strict=True)]
+    nothing = [np.zeros(mask.shape) for mask in masks]
+    if len({mask.shape for mask in masks}) > 1:
+        return nothing
+    some = evenly(range(len(views)), MAX_REST_VIEWS)
+    stack, own = np.stack([views[i].lab for i in some]).astype(np.float32), np.stack([masks[i] for i in some])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a pixel that is inside in all views has no median
+        middle = np.nanmedian(np.where(own[..., None], np.nan, stack), 0)
+        spread = np.nanmedian(np.where(own, np.nan, np.linalg.norm(stack - middle, axis=-1)), 0)
+    deviation = np.maximum(spread, MIN_DEVIATION)
+    known = ((~own).sum(0) >= MIN_REST_VIEWS) & (deviation < MAX_REST_DEVIATION)
+    found, limit = [], MAX_COLOUR_LOG_LIKELIHOOD
+    for view in views:
+        away = np.linalg.norm(view.lab - middle, axis=-1) / deviation
+        ratio = 3 * np.log(COLOUR_RANGE / (deviation * (2 * np.pi) ** 0.5)) - 0.5 * away**2
+        found.append(np.where(known, ratio.clip(-limit, limit), 0.0))
+    agreeing = [(ratio > 0)[~mask].mean() for ratio, mask in zip(found, masks, strict=True) if not mask.all()]
+    return found if agreeing and np.mean(agreeing) >= MIN_REST_SHARE else nothing
+
+
+def outlined(views: Sequence[ObjectView], inside: Sequence[Patches]) -> list[Mask]:
+    """Masks of the superpixels, corrected by pixels before a background at rest: outside is what agrees with it and is
+    connected to the outside, or agrees surely; inside is what disagrees close to the object."""
+    masks, found = [own[view.patches] for view, own in zip(views, inside, strict=True)], []
+    for mask, ratio in zip(masks, at_rest(views, masks), strict=True):  # once: a vase looks alike from all sides
+        smooth = ndimage.gaussian_filter(ratio, 1.0)
+        outside = ndimage.binary_propagation(~mask, mask=~mask | (smooth > 0)) | (smooth > SURE_REST)
+        found.append(ndimage.binary_dilation(~outside, mask=~outside | (smooth < 0), iterations=REST_PIXELS))
+    return found
 
 
 def distinctness(views: Sequence[ObjectView], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
