@@ -52,7 +52,7 @@ def test_unwrapping_and_rendering_are_inverse():
     from lumigraph import kernels
 
     beside = kernels.neighbours(faces)
-    seen = textured(vertices, rgb.float() / 255, faces, beside, uv, photograph.camera, torch.ones(1, 3))
+    seen = textured(vertices, rgb.float() / 255, faces, faces, beside, uv, photograph.camera, torch.ones(1, 3))
     inner = tiny.ball(photograph.camera.pose[0])[0] < 2.6
     assert float((seen.rgb - photograph.rgb)[inner].abs().mean()) < 0.02
     assert float((seen.depth - tiny.ball(photograph.camera.pose[0])[0])[inner].abs().max()) < 0.02

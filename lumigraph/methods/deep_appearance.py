@@ -171,6 +171,7 @@ class DeepAppearance(Method):
         self.networks = Networks(c, 3 * vertices, frame.times is not None)
         faces, self.uv = grid_faces(c.mesh_rows, c.mesh_columns)
         self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("solid", faces, persistent=False)
         self.register_buffer("beside", kernels.neighbours(faces), persistent=False)
         self.hull = Kept(torch.empty(0, 15))
         self._unwrapped: Unwrapped | None = None
@@ -229,12 +230,13 @@ class DeepAppearance(Method):
         self.deviations.copy_(torch.stack([deviation.cpu(), spread.cpu()]).sqrt().clamp_min(MIN_DEVIATION))
 
     def _lay_hull(self) -> None:
-        """Take faces, texture coordinates and neighbours from the kept hull, whose faces share no vertex."""
+        """Take faces, texture coordinates and neighbours from the kept hull. `faces` share no vertex; `solid` are they
+        with one vertex at each place, for `kernels.antialias`."""
         if rows := len(self.hull.rows):
             corners = self.hull.rows[:, :9].reshape(-1, 3)
-            merged = corners.unique(dim=0, return_inverse=True)[1].view(-1, 3)
-            self.faces = torch.arange(3 * rows, device=self.device).view(-1, 3)
-            self.uv, self.beside = self.hull.rows[:, 9:].reshape(-1, 2).cpu(), kernels.neighbours(merged)
+            number, place = torch.arange(3 * rows, device=self.device), corners.unique(dim=0, return_inverse=True)[1]
+            self.faces, self.solid = number.view(-1, 3), number.clone().scatter(0, place, number)[place].view(-1, 3)
+            self.uv, self.beside = self.hull.rows[:, 9:].reshape(-1, 2).cpu(), kernels.neighbours(self.solid)
 
     def placed(self, mesh: Float[Tensor, "vertex 3"]) -> Float[Tensor, "corner 3"]:
         """Vertices of `faces`: of a moment's mesh, or of the hull of what stays still."""
@@ -338,7 +340,7 @@ class DeepAppearance(Method):
             height, width = shape(camera)
             empty = torch.zeros(height, width, device=self.device)
             return Rendering(self.background.expand(height, width, 3).clone(), empty + torch.inf, empty)
-        return textured(*self.decoded(camera), self.faces, self.beside, self.uv, camera, self.background)
+        return textured(*self.decoded(camera), self.faces, self.solid, self.beside, self.uv, camera, self.background)
 
     @torch.no_grad()
     def mesh(self) -> Mesh:
@@ -355,19 +357,23 @@ def textured(
     vertices: Float[Tensor, "vertex 3"],
     texture: Float[Tensor, "3 side side"],
     faces: Int[Tensor, "face 3"],
+    solid: Int[Tensor, "face 3"],
     beside: Int[Tensor, "face 3"],
     uv: Float[Tensor, "vertex 2"],
     camera: Camera,
     background: Float[Tensor, "1 3"],
 ) -> Rendering:
-    """A textured mesh in one camera, its silhouette antialiased. beside: `kernels.neighbours`"""
+    """A textured mesh in one camera, its silhouette antialiased.
+
+    solid: the faces joined across seams of the texture;  beside: their `kernels.neighbours`
+    """
     height, width = shape(camera)
     corners = projected(vertices, camera)
     found_uv, depth, found = kernels.rasterize_mesh(corners, uv.to(vertices), faces, (width, height), NEAR)
     seen = (found >= 0)[..., None]
     rgb = sampled(texture, found_uv.view(-1, 2)).view(height, width, 3).clamp(0, 1) * seen
     values = torch.cat([rgb, seen.float()], -1)
-    values = kernels.antialias(values, depth, found, corners, faces, beside)
+    values = kernels.antialias(values, depth, found, corners, solid, beside)
     opacity = values[..., 3].clamp(0, 1)
     along = (camera.rays(camera.pixels()).directions @ camera.forward[0]).view(height, width).clamp_min(1e-3)
     away = torch.where(found >= 0, depth / along, torch.inf)

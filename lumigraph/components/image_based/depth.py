@@ -173,7 +173,7 @@ def hull_surface(scene: Scene, cells: int = HULL_CELLS) -> Mesh | None:
     for axis, (low, high) in enumerate(zip(*scene.frame.bounds, strict=True)):
         solid[(slice(None),) * axis + ((centres < low) | (centres > high),)] = False
     places = torch.from_numpy(2 / cells * (np.argwhere(solid) + 0.5) - 1).float()
-    views = scene.cameras[evenly(scene.splits["train"].tolist(), HULL_VIEWS)]
+    views = scene.cameras[torch.tensor(evenly(scene.splits["train"].tolist(), HULL_VIEWS))]
     seen = torch.stack([views[i].locate(places)[1] for i in range(len(views))]).float().mean(0)
     solid[solid] = (seen >= HULL_SEEN).numpy()  # a place outside the pictures is in no silhouette
     if not scene.frame.has_alpha or scene.frame.times is not None or not solid.any():
