@@ -127,10 +127,10 @@ def with_beside(scene: Scene) -> Scene:
 
     def beside(image: int) -> np.ndarray:
         stored, chance = layer.stored(image), np.random.default_rng(image)
-        shape = np.array(stored.shape[:2])
-        angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * shape.max() * chance.random(shape) ** 2
+        shape = stored.shape[:2]
+        angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * max(shape) * chance.random(shape) ** 2
         moved = np.indices(shape) + np.rint(away * np.stack([np.sin(angle), np.cos(angle)])).astype(int)
-        row, column = np.clip(moved, 0, (shape - 1)[:, None, None])
+        row, column = np.clip(moved, 0, np.array(shape)[:, None, None] - 1)
         return stored[row, column]
 
     planes = [plane and LayerSource(partial(beside, image)) for image, plane in enumerate(layer.planes)]
