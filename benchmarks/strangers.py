@@ -497,7 +497,7 @@ def publish(results: dict[str, Any]) -> None:
 def verdict(result: Result) -> str:
     """Column of a cell in the table."""
     if result.outcome == "ok":
-        return ("below, unsaid" if result.fault else "below") if result.below else "above"
+        return "below" if result.below else "above"
     return result.outcome
 
 

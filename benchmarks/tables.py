@@ -211,8 +211,7 @@ def headline(row: Row) -> str:
 
 VERDICTS = {
     "above": "better than the baseline",
-    "below": "worse, and it says so",
-    "below, unsaid": "worse, and nothing says so",
+    "below": "worse",
     "refused": "refused",
     "too slow": "too slow",
     "crash": "crashed",
