@@ -287,7 +287,7 @@ def main(options: Options) -> None:
     for number, cell in enumerate(cells, 1):
         results[cell.name] = result = carry_out(cell, output)
         print(f"{number} of {len(cells)}: {cell.method}, {cell.setting}: {described(result)}", flush=True)
-        about = {"machine": f"{os.cpu_count()} threads, no GPU", "commit": commit(), "budget": options.budget}
+        about = {"machine": f"{os.cpu_count()} threads", "commit": commit(), "budget": options.budget}
         kept = {name: asdict(one) for name, one in results.items()}
         path.write_text(json.dumps(about | {"cells": kept}, indent=1) + "\n", "utf-8")
         alike = [one for one in chosen(options, output) if one.method == cell.method]
@@ -497,7 +497,7 @@ def publish(results: dict[str, Any]) -> None:
 def verdict(result: Result) -> str:
     """Column of a cell in the table."""
     if result.outcome == "ok":
-        return ("below, unsaid" if result.fault else "below") if result.below else "above"
+        return "below" if result.below else "above"
     return result.outcome
 
 
@@ -516,7 +516,7 @@ def described(result: Result) -> str:
 def said(result: Result) -> str:
     """Score beside baseline."""
     if result.score is None:
-        return "no score"
+        return ""
     value, unit = result.score["value"], result.score.get("unit", "")
     beside = "" if result.baseline is None else f" ({result.baseline:.3g})"
     return f"{result.score['name']} {value:.3g}{' ' if unit else ''}{unit}{beside}"

@@ -198,7 +198,10 @@ def by_verdict(cells: Sequence[Row], page: Path) -> list[str]:
     rows = [["method", *(VERDICTS[name] for name in verdicts)]]
     for method in dict.fromkeys(row["method"] for row in cells):
         own = [row for row in cells if row["method"] == method]
-        told = ["; ".join(f"{x['setting']} {x['score']}".strip() for x in own if x["verdict"] == v) for v in verdicts]
+        told = [
+            "; ".join(": ".join(filter(None, (x["setting"], x["score"]))) for x in own if x["verdict"] == v)
+            for v in verdicts
+        ]
         rows.append([link(method, page), *told])
     return markdown(rows)
 
@@ -211,8 +214,7 @@ def headline(row: Row) -> str:
 
 VERDICTS = {
     "above": "better than the baseline",
-    "below": "worse, and it says so",
-    "below, unsaid": "worse, and nothing says so",
+    "below": "worse",
     "refused": "refused",
     "too slow": "too slow",
     "crash": "crashed",

@@ -529,6 +529,11 @@ def test_a_unit_and_an_origin_change_the_source_and_not_the_scene():
         torch.testing.assert_close(depth, other, atol=1e-5, rtol=1e-5)
 
 
+def test_a_tracked_mesh_has_the_unit_of_its_photographs():
+    head, large = (nuisance(text, "head,size=16,views=8") for text in ("", "scale=1000,offset=7"))
+    torch.testing.assert_close(large.about["vertices"], 1000 * head.about["vertices"] + 7, rtol=1e-4, atol=1e-3)
+
+
 def test_training_poses_are_off_by_pixels_and_the_truth_is_known():
     exact, off = nuisance("", "still-life,size=64,views=30"), nuisance("poses=3", "still-life,size=64,views=30")
     train, test = off.splits["train"], off.splits["test"]

@@ -39,6 +39,7 @@ BOARD_WAY, BOARD_SIZE, SWAY = 0.5, 2.5, 0.15  # of a backdrop: shares of that di
 BORDER = 0.12  # share of a picture's width at each side
 JUMP = 0.05  # share of the depth between neighbours that makes an edge
 LEVELS, WRONG_SCALE, SECOND_RETURN = 24, 1.05, 0.1  # of a depth picture: quantised, scaled; share of pixels
+TRACKED = "vertices"  # of `Scene.about`: points of a tracked mesh, source's frame
 LABEL_BLOCK = 8  # pixels along the side of a patch with a wrong label
 
 
@@ -301,6 +302,7 @@ def moved(capture: Capture, scale: float, offset: float) -> Capture:
     def pose_of(pose: np.ndarray) -> np.ndarray:
         return np.concatenate([pose[:, :3], scale * pose[:, 3:] + offset], 1)
 
+    placed = {TRUE_POSE: pose_of, TRACKED: lambda points: scale * points + offset}
     shots = [
         replace(
             shot,
@@ -309,7 +311,8 @@ def moved(capture: Capture, scale: float, offset: float) -> Capture:
                 name: replace(plane, scale=scale * plane.scale) if plane.encoding in ("distance", "z-depth") else plane
                 for name, plane in shot.planes.items()
             },
-            about=shot.about | {name: pose_of(pose) for name, pose in shot.about.items() if name == TRUE_POSE},
+            about=shot.about
+            | {name: change(shot.about[name]) for name, change in placed.items() if name in shot.about},
         )
         for shot in capture.shots
     ]
