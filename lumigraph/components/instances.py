@@ -127,7 +127,7 @@ def with_beside(scene: Scene) -> Scene:
 
     def beside(image: int) -> np.ndarray:
         stored, chance = layer.stored(image), np.random.default_rng(image)
-        shape = stored.shape[:2]
+        shape: tuple[int, int] = stored.shape[:2]
         angle, away = chance.uniform(0, 2 * np.pi, shape), BESIDE_REACH * max(shape) * chance.random(shape) ** 2
         moved = np.indices(shape) + np.rint(away * np.stack([np.sin(angle), np.cos(angle)])).astype(int)
         row, column = np.clip(moved, 0, np.array(shape)[:, None, None] - 1)

@@ -122,7 +122,9 @@ def cameras_of(folder: Path, names: Sequence[str]) -> dict[str, Json]:
     return dict(zip(names, table, strict=True))
 
 
-def posed(pose: np.ndarray, focal: Sequence[float], centre: Sequence[float], **more: Any) -> Json:
+def posed(
+    pose: np.ndarray, focal: Sequence[float] | np.ndarray, centre: Sequence[float] | np.ndarray, **more: Any
+) -> Json:
     """A frame of a transforms.json. pose: camera-to-world, +y down and +z forward"""
     matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     (fx, fy), (cx, cy) = map(list, (map(float, focal), map(float, centre)))

@@ -264,7 +264,7 @@ def on_splines(
     """
     rows, y = len(times), values.cpu().double().numpy()
     h = (times.diff() / times.diff().median()).cpu().double().numpy()
-    second = diags_array([1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]], offsets=[0, 1, 2], shape=(rows - 2, rows))  # type: ignore[arg-type]
+    second = diags_array([1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]], offsets=[0, 1, 2], shape=(rows - 2, rows))
     square = second @ second.T
     curvature = np.stack([np.pad(square.diagonal(k), (0, k)) for k in range(3)])
     overlap = np.stack([(h[:-1] + h[1:]) / 3, np.pad(h[1:-1] / 6, (0, 1)), np.zeros(rows - 2)])  # of hats
