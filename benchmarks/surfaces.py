@@ -25,6 +25,7 @@ from lumigraph import methods
 from lumigraph.files import write_json
 from lumigraph.opening import open_scene
 from lumigraph.run import Run, build
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 CELLS = 160  # of the grid of the made object, along each side
@@ -85,7 +86,7 @@ def learnt(name: str, folder: Path, output: Path, options: Options) -> dict:
     scene, kind = open_scene(str(folder)), methods.find(name)
     run = Run.create(output, build(kind, scene.frame, kind.cpu_preset(), torch.device("cpu"), 0), scene)
     begin = time.process_time()
-    fit(run.new_method(), scene, run, seconds=options.seconds, show=False)
+    go_on_unless(fit(run.new_method(), scene, run, seconds=options.seconds, show=False).signal)
     spent = time.process_time() - begin
     found = mesh.beside_truth(run, 40)
     return {"steps": run.state.step, "processor s": round(spent, 1)} | found

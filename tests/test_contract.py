@@ -24,7 +24,17 @@ from budgets import PER_METHOD, budget
 import lumigraph
 from lumigraph import methods
 from lumigraph.camera import Camera
-from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
+from lumigraph.camera.lens import (
+    Division,
+    Equirectangular,
+    FieldOfView,
+    Fisheye,
+    Lens,
+    OmnidirectionalStereo,
+    OpenCV,
+    Pinhole,
+    ThinPrism,
+)
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
 from lumigraph.commands.eval import compared
@@ -318,6 +328,9 @@ def lens_of(kind: str) -> tuple[Lens, tuple[int, int]]:
         "pinhole": Pinhole(focal, centre),
         "opencv": OpenCV(focal, centre, torch.tensor([[-0.1, 0.02, 1e-3, -1e-3, 0, 0, 0, 0]])),
         "fisheye": Fisheye(focal / 3, centre, torch.tensor([[0.05, 0, 0, 0]])),
+        "thinprism": ThinPrism(focal / 3, centre, torch.tensor([[0.05, 0, 0, 0, 1e-3, -1e-3, 1e-3, 0]])),
+        "fieldofview": FieldOfView(focal, centre, torch.tensor([[0.8]])),
+        "division": Division(focal, centre, torch.tensor([[-0.1]])),
         "equirectangular": Equirectangular(whole),
         "omnidirectionalstereo": OmnidirectionalStereo(whole, offset=torch.tensor([[0.03]])),
     }

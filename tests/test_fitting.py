@@ -149,7 +149,7 @@ def test_open_captures_are_refused(kind):
     scene = tiny.scene()
     open_scene = replace(scene, frame=replace(scene.frame, reach=4.0))
     with pytest.raises(LumigraphError, match="horizon"):
-        kind(scene.frame, kind.smallest()).begin(open_scene)
+        kind(scene.frame, kind.smallest()).check_data(open_scene)
 
 
 def test_voxels_without_anything_solid_have_no_mesh():

@@ -204,7 +204,7 @@ def test_help_shows_ranges_that_surprise(capsys):
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "(default: 16; 1 to 4,096)" in told  # a Config's
     assert "1 to 1,000,000" not in told  # any count
-    assert "(default: 0.01; 0 to 1)" in told
+    assert "(default: 0.01, of own meshes 0; 0 to 1)" in told
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
-from lumigraph.methods.regnerf import FINAL_TABLE_LEARNING_RATE, RegNeRF, clipped, field_of, joined
+from lumigraph.methods.regnerf import RegNeRF, clipped, field_of, joined
 from lumigraph.methods.regnerf.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.readers.views import with_fewer_views
 from lumigraph.run import build
@@ -44,10 +44,10 @@ def chance(seed: int = 0) -> torch.Generator:
 
 def of_table(config) -> NgpConfig:
     """The numbers of RegNeRF's hash table as Instant-NGP has them."""
-    rates = {"learning_rate": config.table_learning_rate, "final_learning_rate": FINAL_TABLE_LEARNING_RATE}
     parts = {name: getattr(config, name) for name in ("table", "occupancy", "steps", "proposals", "poses")}
     losses = {"hash_weight_decay": config.hash_weight_decay, "huber_delta": config.huber_delta}
-    return NgpConfig(**parts, **rates, **losses, hidden_width=config.table_width, seed=config.seed)
+    rate = config.table_learning_rate
+    return NgpConfig(**parts, **losses, learning_rate=rate, hidden_width=config.table_width, seed=config.seed)
 
 
 def test_the_point_nearest_to_lines():

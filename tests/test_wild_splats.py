@@ -363,6 +363,7 @@ def test_a_sheet_before_a_training_camera_goes():
         step = method.step_on(scene.photograph(1), 1)
         step.due = True
         method.tidying.finish(step)
+        method.follow_rebuilds()
     assert len(method.cloud) == before - 1 == len(method.cloud.view_bits)
     assert len(method.cloud) == len(method.density_control.positional_gradient_sum)
     assert float(camera_distance(method.cloud.means, scene.cameras.position).min()) > scene.frame.near

@@ -54,7 +54,8 @@ class Baselines:
     """
 
     def __init__(self, scene: Scene, evidence: int | None = None):
-        self.scene, train = scene, scene.splits["train"].tolist()
+        train = scene.splits["train"].tolist() if "train" in scene.splits else []
+        self.scene = scene
         self.train = evenly(train, evidence or len(train))
         self.points = pose_points(scene.cameras)
         self._mean: Picture | None = None

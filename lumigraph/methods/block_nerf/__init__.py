@@ -25,13 +25,12 @@ from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
-from ...files.ranges import Layers, NonNegative, PositiveShare, Seed, Steps, Width, changed
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, changed
 from ...method import FieldMethod, seeded
 from ...method.field import Directions, Points
 from ...volume import composite
 from .parts import Exposures, Moving, Visibility
 
-EXPOSURE_FREQUENCIES = 4  # octaves of the exposure's encoding, section 4.2.3
 VISIBILITY_FREQUENCIES = 6  # octaves of positions in the visibility network, section 4.2.5
 
 
@@ -52,6 +51,7 @@ class Config:
     appearance: bool = True  # learn an appearance code for each photograph, section 4.2.1; off: one light
     appearance_code: CodeWidth = 32  # numbers of an appearance code, section 4.2.1; more fit its light more closely
     exposure: bool = True  # log exposure as an input, where photographs state it, section 4.2.3; off: ignored
+    exposure_frequencies: Octaves = 4  # octaves of the exposure's encoding, section 4.2.3; more fit it more closely
     visibility: bool = True  # learn which places were seen, section 4.2.5; off: all blocks count as seeing
     visibility_layers: Layers = 4  # hidden layers of the visibility network; more cost time
     visibility_width: Width = 128  # channels of the visibility network; wider costs time
@@ -81,7 +81,7 @@ class BlockNeRF(FieldMethod):
         space, photographs, self.sky = space_of(frame), frame.image_count, None
         self.poses = poses_for(frame, c.poses)
         # Exposures come first: the appearance of a photograph is found in its exposure.
-        self.exposures = Exposures(photographs, EXPOSURE_FREQUENCIES) if c.exposure else None
+        self.exposures = Exposures(photographs, c.exposure_frequencies) if c.exposure else None
         evidence = Photograph, Patches, Appearance
         codes = photographs, c.appearance_code, evidence, FIT_PIXELS
         self.appearance = AppearanceCodes(*codes) if c.appearance else None
@@ -112,7 +112,7 @@ class BlockNeRF(FieldMethod):
     def smallest(cls) -> Any:
         """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
         return changed(Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
-            visibility_layers=1, visibility_width=16,
+            exposure_frequencies=2, visibility_layers=1, visibility_width=16,
             warmup_steps=RISE, pose_penalty=1.0)  # fmt: skip
 
     # Learning

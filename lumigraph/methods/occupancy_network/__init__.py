@@ -23,7 +23,7 @@ from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
-from ...files.ranges import Count, LearningRate, Seed, Width, between, changed
+from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between, changed
 from ...method import seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
@@ -34,8 +34,6 @@ FIT_LEARNING_RATE = 0.02  # Adam's learning rate of a new code, in deviations of
 CLOUD_NOISE = 0.01  # deviation of noise of a cloud's points in training, scene units
 VIEWS = 24  # pictures of each shape to learn from, around it, section 4.2
 FINAL_LEARNING_RATE = 1e-4  # learning rate at the end of the budget, reached exponentially
-
-BLOCKS = 5  # residual blocks of the decoder, appendix A
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class Config:
     code: Width = 512  # numbers of a code, appendix A; more hold more shapes
     encoder_width: Width = 512  # channels of the encoder, appendix A; wider costs time
     hidden_width: Width = 256  # channels of the decoder, appendix A; wider costs time
+    blocks: Layers = 5  # residual blocks of the decoder, appendix A; more cost time
     octaves: Annotated[int, between(0, 16)] = 0  # octaves of waves that encode points; more give finer detail, noise
     threshold: Annotated[float, between(0.001, 0.999)] = 0.2  # probability at the surface, section 3.3; higher: thinner
     members: Count = 4096  # shapes of a collection at most; the code of each is kept
@@ -126,7 +125,7 @@ class OccupancyNetwork(CodedSurface):
         encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": WholePictureEncoder}
         with seeded(c.seed):
             self.encoder = encoders[c.input](c.code, c.encoder_width)
-            self.decoder = OccupancyDecoder(c.code, c.hidden_width, BLOCKS, c.octaves)
+            self.decoder = OccupancyDecoder(c.code, c.hidden_width, c.blocks, c.octaves)
         self.codes.rows.requires_grad_(False)  # encoded, not learnt
         self.pools = PointPools("occupancy-network", c.points, c.seed)
         self._evidence: dict[int, Tensor] = {}  # voxels or pictures of members, by number
@@ -141,14 +140,14 @@ class OccupancyNetwork(CodedSurface):
     @classmethod
     def smallest(cls) -> Any:
         return changed(Config(), pool_points=4096, near_share=0.5, cloud_points=32, code=4, encoder_width=8,
-            hidden_width=8, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
+            hidden_width=8, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
             learning_rate=6e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         """Activations that a step keeps for its gradients."""
         points = config.shapes_per_step * config.points_per_shape
-        return 4 * points * 4 * BLOCKS * config.hidden_width * learning
+        return 4 * points * 4 * config.blocks * config.hidden_width * learning
 
     # Learning
 
