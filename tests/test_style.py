@@ -29,7 +29,7 @@ MAX_LINES = 116_830  # of Python
 MAX_LONG_FUNCTIONS = 19  # of more than 60 lines
 MAX_ANY_METHODS = 63  # parameters `method: Any`
 MAX_ROOMS = 38  # names at the top level
-MAX_OPTIONS = 1_061  # of all methods, those of parts counted for each method that holds them
+MAX_OPTIONS = 1_063  # of all methods, those of parts counted for each method that holds them
 TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
 
 
