@@ -140,7 +140,7 @@ def usdz(mesh: Mesh, normals: Float[np.ndarray, "vertex 3"], upright: Float[np.n
 
 
 def binary(layer: str) -> dict[str, bytes]:
-    """The root of an archive by its name: a layer in binary, a third of the bytes; its text without usd-core."""
+    """The root of an archive by its name: a layer in binary, which is smaller; its text without usd-core."""
     try:
         from pxr import Sdf
     except ImportError:
