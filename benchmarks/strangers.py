@@ -240,7 +240,7 @@ class Cell:
 
 @dataclass
 class Result:
-    """What became of a cell; see the page's head."""
+    """Outcome of a cell; see the page's head."""
 
     method: str
     setting: str

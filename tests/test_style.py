@@ -25,7 +25,7 @@ ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each
 RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
 # Of the package: who lowers a number lowers its ceiling.
-MAX_LINES = 116_830  # of Python
+MAX_LINES = 116_820  # of Python
 MAX_LONG_FUNCTIONS = 19  # of more than 60 lines
 MAX_ANY_METHODS = 63  # parameters `method: Any`
 MAX_ROOMS = 38  # names at the top level

@@ -42,20 +42,20 @@ class CaptureCommand(MotionOptions, Output):
         if not self.what:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
         folder = self.output or scene_folder(self.what)
-        first, only = self.what[0].expanduser(), len(self.what) == 1
-        if only and ((recorded := is_recorded(first)) or (self.moving and is_rig(first))):
-            made = (
-                capture_recorded(first, folder, self.frames, track)
-                if recorded
-                else capture_rig(first, folder, self, track)
-            )
+        first, only, made = self.what[0].expanduser(), len(self.what) == 1, None
+        recorded = only and is_recorded(first)
+        method = "deformable-splatting" if self.moving and not recorded else "gaussian-splatting"
+        onward = typed("train", method, folder)
+        if recorded:
+            made = capture_recorded(first, folder, self.frames, track)
+        elif only and self.moving and is_rig(first):
+            made = capture_rig(first, folder, self, track)
+        if made is not None:
             rows, said = made
-            method = "gaussian-splatting" if recorded else "deformable-splatting"
-            show(rows | {"scene": str(folder), "next": typed("train", method, folder)})
+            show(rows | {"scene": str(folder), "next": onward})
             for sentence in said:
                 say(f"warning: {sentence}")
             return 0
-        onward = typed("train", "deformable-splatting" if self.moving else "gaussian-splatting", folder)
         show_all(folder, find_cameras(self.what, folder, self), onward, self.mask_object)
         return 0
 

@@ -104,9 +104,8 @@ def check_labels(scene: Scene) -> None:
 def warn_of_few_views(scene: Scene) -> None:
     """Warn of labels that hardly any training photograph shows."""
     layer, train = scene.layers[LABELS], scene.splits["train"].tolist()
-    views = Counter[int](
-        x for i in train if layer.planes[i] for x in np.unique(layer.stored(i)[layer.known(layer.stored(i))]).tolist()
-    )
+    every = (layer.stored(i) for i in train if layer.planes[i])
+    views = Counter[int](label for stored in every for label in np.unique(stored[layer.known(stored)]).tolist())
     few = [label for label, count in sorted(views.items()) if count < MIN_LABEL_VIEWS]
     if few:
         warnings.warn(

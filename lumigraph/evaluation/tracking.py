@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ class Tracked:
         ]
         return line_chart(curves, "metres of the path", "error, cm", smoothed=False)
 
-    @property
+    @cached_property
     def map(self) -> str:
         """Chart of the path with its loops, on the plane in which it extends most; beside the true one, if known."""
         if len(self.images) < MIN_POSES:

@@ -77,9 +77,12 @@ def extract_points(
     """
     method.eval()
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
-    good = [wanted(seen, crop) for seen in depth_maps]
+    good = [seen.solid & (seen.facing > MIN_COSINE) for seen in depth_maps]
     if crop is not None:
-        inside, every = (sum(int(x.sum()) for x in masks) for masks in (good, [wanted(x, None) for x in depth_maps]))
+        every = sum(int(mask.sum()) for mask in good)
+        for seen, mask in zip(depth_maps, good, strict=True):
+            mask[mask.clone()] = crop.holds(seen.positions(mask))
+        inside = sum(int(mask.sum()) for mask in good)
         name_cut(1 - inside / max(every, 1), "lies outside the crop", "a larger one holds more")
     share = min(1.0, CANDIDATES_PER_POINT * options.count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
@@ -98,14 +101,6 @@ def extract_points(
         columns = thinned(kept, options.count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
     return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
-
-
-def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
-    """Mask of pixels with a surface at a steep angle, inside the crop."""
-    good = seen.solid & (seen.facing > MIN_COSINE)
-    if crop is not None:
-        good[good.clone()] = crop.holds(seen.positions(good))
-    return good
 
 
 def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> Bool[Tensor, " point"]:

@@ -92,8 +92,13 @@ def other_masks(shots: list[Shot], folder: Path) -> Path | None:
     if not isinstance(files, dict):
         return None
     picture = files[min(files)]
-    beside = [picture.with_name(f"{name}.png") for name in (f"{picture.stem}_mask", f"dynamic_mask_{picture.stem}")]
+    beside = [picture.with_name(f"{name}.png") for name in names_beside(picture.stem)]
     return next((x for x in (*beside, *(folder / name for name in OTHER_MASKS)) if x.exists()), None)
+
+
+def names_beside(photograph: str) -> tuple[str, str]:
+    """Names, without suffix, that other programs give to the mask beside a photograph."""
+    return f"{photograph}_mask", f"dynamic_mask_{photograph}"
 
 
 def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:

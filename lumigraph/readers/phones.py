@@ -109,7 +109,8 @@ def stray_path(folder: Path) -> dict[int, list[float]]:
     path = folder / STRAY_FILES[0]
     with reading(path, "has lines that are no poses", "export it again"):
         words = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
-        rows = [list(map(float, row)) for row in words[not words[0][0].strip().lstrip("-")[:1].isdigit() :]]
+        titled = not words[0][0].strip().lstrip("-")[:1].isdigit()
+        rows = [list(map(float, row)) for row in (words[1:] if titled else words)]
         return {int(row[1]) if len(row) > 8 else i: row[-7:] for i, row in enumerate(rows)}
 
 

@@ -31,9 +31,7 @@ IMAGE_SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES,
     ".avif", ".jfif", ".jp2",
 )  # fmt: skip
-LARGE = (
-    64_000_000  # pixels beyond which a JPEG is decoded at a half, a quarter or an eighth, not below three final sizes
-)
+LARGE = 64_000_000  # pixels beyond which a JPEG is decoded at a half, a quarter or an eighth, from three final sizes on
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import LumigraphError
 from ..files import claim_folder, is_file, read_json, replacing_folder, write_json
+from ..geometry import evenly
 from ..readers import phones
 from ..readers.rig import calibration, cameras_of
 from .folder import POINTS_FILE
@@ -154,9 +155,7 @@ def capture_recorded(
     MAX_RECORDED at most by default. Returns rows to print, and remarks."""
     claim_folder(folder, "capture")
     numbers, tags = sorted(phones.stray_path(source)), tags_of(source / RECORDED_FILM)
-    chosen = [
-        numbers[i] for i in np.linspace(0, len(numbers) - 1, min(count or MAX_RECORDED, len(numbers))).astype(int)
-    ]
+    chosen = evenly(numbers, count or MAX_RECORDED)
     with replacing_folder(folder, "capture") as partial:
         (partial / "rgb").mkdir(parents=True)
         written = []

@@ -20,7 +20,7 @@ from ...files.foreign import about_file
 from ...files.names import counted, natural
 from ...files.reading import reason_of
 from ...readers.exif import read_facts
-from ...readers.masks import LABELS, MASKS, OBJECT_MASKS, OTHER_MASKS, PLANES, find_mask
+from ...readers.masks import LABELS, MASKS, OBJECT_MASKS, OTHER_MASKS, PLANES, find_mask, names_beside
 from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
@@ -184,7 +184,7 @@ def walk(
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
-    stems = {entry.stem for entry in entries}
+    masks = {name for entry in entries for name in names_beside(entry.stem)}
     for entry in entries:
         if entry.name.startswith(".") or (work is not None and entry.resolve() == work):
             continue
@@ -194,16 +194,8 @@ def walk(
                 continue
             if not entry.is_symlink() and not any(exists(entry / name) for name in PROGRAM_FILES):
                 yield from walk(entry, work, list_entries)
-        elif (entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry)) and not is_mask(entry, stems):
+        elif (entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry)) and entry.stem not in masks:
             yield entry
-
-
-def is_mask(path: Path, stems: set[str]) -> bool:
-    """True for image_mask.png and dynamic_mask_image.png beside image.jpg."""
-    stem = path.stem
-    return (stem.endswith("_mask") and stem[: -len("_mask")] in stems) or (
-        stem.startswith("dynamic_mask_") and stem.removeprefix("dynamic_mask_") in stems
-    )
 
 
 def films_in(sources: Sequence[Path]) -> list[Path]:
