@@ -24,7 +24,7 @@ from ..components.tracking.frames import DepthFrame, Moment
 from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
 from ..components.tracking.trajectory import Pose, apply_twists
 from ..datasets.scene import Frame, Scene
-from ..errors import LumigraphError, LumigraphWarning
+from ..errors import LumigraphWarning
 from ..files.ranges import CloudSize, Count, Seed, between, changed
 from ..gaussians import Gaussians
 from ..gaussians.cloud import joined
@@ -132,13 +132,6 @@ class SplatSlam(Method):
     def compile_begin(self) -> None:
         super().compile_begin()
         self.rehearses = True
-
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        super().begin(data, seconds)
-        if "depth" not in data.layers:
-            raise LumigraphError(
-                f"{data.source} has no depth, from which Gaussians are made; train gaussian-splatting, which needs none"
-            )
 
     def batch(self, data: Scene, generator: torch.Generator) -> Moment:
         """The frame that is next, and the scene."""

@@ -71,9 +71,10 @@ class Tracker(Part):
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        if self.numbers.track and "depth" not in data.layers:
+        if "depth" not in data.layers:
             raise LumigraphError(
-                f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
+                f"{data.source} has no depth, which maps of depth cameras are made of; train instant-ngp or "
+                "gaussian-splatting, which need none"
             )
 
     def sequence(self, data: Scene) -> list[int]:
