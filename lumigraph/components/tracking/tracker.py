@@ -112,7 +112,7 @@ class Tracker(Part):
         """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
         keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
         older = [self.load_keyframe(data, i) for i in keyframes if i != frame.index]
-        if self.loops is None or not self.loops.find(frame, older):
+        if self.loops is None or not self.loops.find(frame, older, self.trajectory.poses):
             return False
         self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
         return True
