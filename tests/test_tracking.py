@@ -37,7 +37,7 @@ from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.readers.unposed import Unposed
 from lumigraph.readers.unposed import unposed as without_poses
 
-pytestmark = budget("methods", 4)
+pytestmark = budget("methods", 6)
 
 
 def walk(count: int = 20, seed: int = 0) -> np.ndarray:
