@@ -1,7 +1,5 @@
 """Mesh files: PLY, OBJ, GLB and USDZ, each with colours or texture in the form that most programs read."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A probe renders the six faces of a cube. Pixels are decoded to linear light, so 
 weighted by their solid angle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Camera paths of films: automatic ones, and curves through keyframes."""
 
-from __future__ import annotations
-
 from ..camera import Camera
 from ..datasets.scene import Frame
 from ..errors import LumigraphError

@@ -4,8 +4,6 @@ Clusters of the features under the strokes, by k-means; each point is matched wi
 smoothed by a bilateral filter on the graph of neighbours, and the part grows from the strokes over neighbours of it.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 

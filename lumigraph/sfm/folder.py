@@ -1,7 +1,5 @@
 """A scene's folder: photographs, COLMAP's model and transforms.json, in other programs' layout."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Container, Sequence

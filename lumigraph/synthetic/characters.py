@@ -5,8 +5,6 @@ four static cameras at training times and halfway between two of them, and as sp
 every joint is turned by UNSEEN_TURN degrees about a random axis.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

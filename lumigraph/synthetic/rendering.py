@@ -1,7 +1,5 @@
 """Rendering of a world for a camera: rays through every pixel, traced on all cores, averaged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

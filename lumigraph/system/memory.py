@@ -1,7 +1,5 @@
 """Memory: peak use of this process, free memory, and the budget of images."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Tab `Measure` of a client: distance of two clicked points, and the unit of exports by a known length."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Photographs as bytes, and other values of every pixel: in memory, or, where they are too large, in files."""
 
-from __future__ import annotations
-
 from .cache import cache_folder as cache_folder
 from .cache import in_parallel as in_parallel
 from .layer import ENCODINGS as ENCODINGS

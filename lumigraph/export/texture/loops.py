@@ -1,7 +1,5 @@
 """Loops over triangles and texels (Numba)."""
 
-from __future__ import annotations
-
 import math
 
 from numba import njit, prange

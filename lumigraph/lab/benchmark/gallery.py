@@ -6,8 +6,6 @@ OUTPUT/
 └── runs/, results.json, results.md    as of every benchmark
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape

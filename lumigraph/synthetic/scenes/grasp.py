@@ -1,7 +1,5 @@
 """A hand that grasps a can and lets it go, from time 0 to time 1: 16 bones of the hand and one of the can."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A tail: a chain of 2 to 60 bones in a row that winds from time 0 to time 1; see `characters`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

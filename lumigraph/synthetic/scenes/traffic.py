@@ -4,8 +4,6 @@ Cars are rigid, and their boxes are known at all times. The held-out photographs
 two training photographs. `with_edits` renders the truth of an edited scene.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """A walker: a figure of soft limbs on 16 bones, which walks on the spot from time 0 to time 1; see `characters`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
