@@ -211,11 +211,7 @@ def glb(file: MeshFile) -> Parts:
             {
                 "name": "source",
                 "primitives": [
-                    {
-                        "attributes": {name: i for i, name in enumerate(columns)},
-                        "indices": len(columns),
-                        "material": 0,
-                    }
+                    {"attributes": {name: i for i, name in enumerate(columns)}, "indices": len(columns), "material": 0}
                 ],
             }
         ],

@@ -89,10 +89,7 @@ def export_probes(loaded: Loaded, path: Path, options: ProbesOptions = ProbesOpt
 @torch.no_grad()
 @at_work()
 def bake_probes(
-    method: Method,
-    cameras: Camera | None,
-    box: tuple[Vector, Vector],
-    options: ProbesOptions = ProbesOptions(),
+    method: Method, cameras: Camera | None, box: tuple[Vector, Vector], options: ProbesOptions = ProbesOptions()
 ) -> ProbeGrid:
     """Probes inside a box of the scene's frame, in the frame of exports.
 

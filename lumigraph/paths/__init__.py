@@ -4,7 +4,6 @@ from ..camera import Camera
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from .automatic import PATHS as PATHS
-from .automatic import UP as UP
 from .automatic import Surroundings as Surroundings
 from .automatic import angle_of_view as angle_of_view
 from .automatic import camera_path as camera_path

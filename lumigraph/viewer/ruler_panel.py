@@ -27,12 +27,7 @@ class RulerPanel:
     """
 
     def __init__(
-        self,
-        client: Any,
-        shared: Shared,
-        locate: Locate,
-        drawn: Callable[[], None],
-        notify: Callable[[str, str], None],
+        self, client: Any, shared: Shared, locate: Locate, drawn: Callable[[], None], notify: Callable[[str, str], None]
     ):
         self._client, self._shared, self._locate, self._drawn, self._notify = client, shared, locate, drawn, notify
         self._points: list[Vector] = []
