@@ -136,9 +136,9 @@ def test_what_is_hidden_takes_no_colour_from_what_hides_it(cube, part_of_the_mes
 
 def test_exposures_are_equalised(cube):
     """Each photograph so many times brighter or darker; but one factor for all, the pattern comes back."""
-    cameras, strength = around(24, size=160), np.exp(np.random.default_rng(0).normal(0, 0.2, 24))
+    cameras, strength = around(24, size=100), np.exp(np.random.default_rng(0).normal(0, 0.2, 24))
     views = [picture(cameras[i], cube, lambda x: 0.6 * waves(x), strength[i]) for i in range(24)]
-    mesh = textured(cube, [lambda _: views], TOLERANCE, 256)
+    mesh = textured(cube, [lambda _: views], TOLERANCE, 128)
     points, found = on_surface(mesh)
     truth = 0.6 * waves(points)
     factor = np.median(found / truth)
@@ -161,14 +161,14 @@ def test_gains_solve_for_exposures():
 
 
 def test_what_no_picture_shows_takes_the_next_source_or_the_nearest_colours(cube):
-    views = list(pictures(cube, waves, around(24, size=160, lowest=30.0)))
-    near = textured(cube, [lambda _: views], TOLERANCE, 256)
+    views = list(pictures(cube, waves, around(16, size=100, lowest=30.0)))
+    near = textured(cube, [lambda _: views], TOLERANCE, 128)
     points, found = on_surface(near)
     inner = np.abs(points[:, :2]).max(-1) < 0.48  # edges are interpolated with the sides
     below, lid = inner & (points[:, 2] < -0.499), inner & (points[:, 2] > 0.499)
     assert 0.1 < found[below].min() and found[below].max() < 0.9
     assert np.abs(found - waves(points))[lid].mean() < 0.01
-    then = textured(cube, [lambda _: views, lambda _: pictures(cube, waves, around(24, size=160))], TOLERANCE, 256)
+    then = textured(cube, [lambda _: views, lambda _: pictures(cube, waves, around(16, size=100))], TOLERANCE, 128)
     assert np.abs(on_surface(then)[1] - waves(points)).mean() < 0.01
 
 
