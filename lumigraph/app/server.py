@@ -366,8 +366,8 @@ def check_source(source: Path) -> None:
 # Routes
 
 
-class Handlers:
-    """Handlers of requests, for the routes of `build`."""
+class RequestHandlers:
+    """RequestHandlers of requests, for the routes of `build`."""
 
     def __init__(self, app: App):
         self.app = app
@@ -466,7 +466,7 @@ class Handlers:
 
 def build(app: App) -> ASGIApp:
     """The ASGI application: routes behind the guard."""
-    here = Handlers(app)
+    here = RequestHandlers(app)
     item = "/api/items/{key}"
     routes = [
         Route("/", here.page),
