@@ -3,7 +3,7 @@
     python benchmarks/one_minute.py DATA OUTPUT                                 all of SCENES that DATA has
     python benchmarks/one_minute.py DATA OUTPUT --scenes fox /photographs/cat   these, and captures of your own
     python benchmarks/one_minute.py DATA OUTPUT --seconds 60 --seeds 0 1 2      one budget
-    python benchmarks/one_minute.py DATA OUTPUT --publish                       the figures for `tables.py`, and the chart
+    python benchmarks/one_minute.py DATA OUTPUT --publish                       figures for `tables.py`, and the chart
 
 Each capture is a `lumigraph bench methods` in OUTPUT/CAPTURE, so the same command goes on after Ctrl-C. Run it on an
 otherwise idle machine: budgets are seconds. A change of a trainer is a gain if its means differ by more than the

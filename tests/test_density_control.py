@@ -14,9 +14,9 @@ from lumigraph import kernels, methods
 from lumigraph.components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from lumigraph.components.clouds.cloud import Cloud, CloudAdam
 from lumigraph.components.clouds.density_control import MIN_CAP, PRUNE_OPACITY, RefineNumbers
+from lumigraph.components.clouds.error_density import ErrorDensity
 from lumigraph.components.clouds.initialization import initial_cloud, nearest_distance
 from lumigraph.components.training.row_optimizers import adam_rate
-from lumigraph.components.clouds.error_density import ErrorDensity
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import to_matrix
@@ -233,10 +233,11 @@ def test_a_cap_may_follow_the_budget(numbers, steps, cap, monkeypatch):
     assert control.current_cap(Cloud(cloud(10)), 0.5, steps) == cap
 
 
-def test_a_chain_needs_a_cap():
+@pytest.mark.parametrize("strategy", ["mcmc", "error"])
+def test_what_grows_to_its_cap_needs_one(strategy):
     kind = methods.find("gaussian-splatting")
     with pytest.raises(LumigraphError, match="--max-gaussians"):
-        build(kind, tiny.scene().frame, kind.Config(strategy="mcmc"), torch.device("cpu"), 0)
+        build(kind, tiny.scene().frame, kind.Config(strategy=strategy), torch.device("cpu"), 0)
 
 
 def test_opacity_is_reset_for_all_but_the_faint():

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity
-from ...components.clouds.error_density import ErrorDensity
 from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
+from ...components.clouds.error_density import ErrorDensity
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.instances import edit_of
@@ -53,7 +53,9 @@ class Config:
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.strategy != "adaptive" and not self.cloud.refine.max_gaussians:
+        refine = self.cloud.refine
+        capped = refine.max_gaussians or (self.strategy == "error" and refine.gaussians_per_step)
+        if self.strategy != "adaptive" and not capped:
             raise LumigraphError(f"With --strategy {self.strategy} a cloud grows up to its cap; give --max-gaussians")
 
 
@@ -92,7 +94,8 @@ class GaussianSplatting(CloudMethod):
         """A smaller cloud that begins dense: it learns more in the time."""
         return changed(Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
             half_resolution_until=0.7, max_gaussians=500_000, gaussians_per_step=15.0, cap_ramp=True,
-            strategy="error", refine_until=0.75, densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto")  # fmt: skip
+            strategy="error", refine_until=0.75, densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0,
+            few_views="auto")  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
