@@ -1,7 +1,5 @@
 """`lumigraph eval`: score a run on held-out photographs or shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Evaluate a run or a collection under the protocol for its kind of dataset, and write the results."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
