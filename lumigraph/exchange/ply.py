@@ -42,6 +42,7 @@ FILTER = "filter_3D"  # of Mip-Splatting
 MOTION = re.compile(r"trbf_(center|scale)|motion_\d+|omega_\d+")  # of Spacetime Gaussians
 KNOWN_ELEMENTS = ("face", "chunk", "sh")
 ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
+MAX_REST = 15  # harmonics beyond the constant, of degree 3
 
 
 def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaussians:
@@ -81,7 +82,7 @@ def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaus
         columns(rows, ROTATION),
         log_scales,
         logits,
-        np.concatenate([columns(rows, COLOUR)[:, None], by_coefficient(columns(rows, rest))], 1),
+        np.concatenate([columns(rows, COLOUR)[:, None], by_coefficient(columns(rows, rest))[:, :MAX_REST]], 1),
         is_antialiased(header),
     )
 
@@ -91,6 +92,8 @@ def told(path: Path, header: Header, here: list[str], flat: bool) -> None:
     known = {*MEAN, *NORMAL, *COLOUR, *OPACITY, *SCALE, *ROTATION, FILTER}
     unused = [x for x in here if x not in known and not x.startswith("f_rest_") and not MOTION.match(x)]
     found = [f"passed over: {', '.join(unused)}"] if unused else []
+    if f"f_rest_{3 * MAX_REST}" in here:
+        found.append("harmonics of degree 4 are passed over; those of degree 1 to 3 are kept")
     found += [f"Gaussians without {FLAT} are flat, as 2DGS has them; they get a thin third axis"] if flat else []
     if others := [name for name in header.elements if name not in ("vertex", *KNOWN_ELEMENTS)]:
         found.append(f"elements passed over: {', '.join(others)}")
@@ -135,13 +138,13 @@ def save(path: Path, elements: dict[str, np.ndarray], antialiased: bool) -> None
 
 
 def rest_names(path: Path, properties: list[str]) -> list[str]:
-    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 3."""
+    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 4."""
     count = sum(name.startswith("f_rest_") for name in properties)
     names = [f"f_rest_{i}" for i in range(count)]
-    if count not in (0, 9, 24, 45) or not {*names} <= {*properties}:
+    if count not in (0, 9, 24, 45, 72) or not {*names} <= {*properties}:
         raise LumigraphError(
-            f"{path} has {count} properties f_rest_*, where f_rest_0 and on are 0, 9, 24 or 45 for harmonics of degree "
-            "0 to 3; export it with one of these degrees"
+            f"{path} has {count} properties f_rest_*, where f_rest_0 and on are 0, 9, 24, 45 or 72 for harmonics of "
+            "degree 0 to 4; export it with one of these degrees"
         )
     return names
 

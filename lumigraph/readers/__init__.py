@@ -54,5 +54,11 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     raise LumigraphError(
         about_poses(folder)
         or f"{folder} holds no camera poses ({pictures} images were found); find the poses first: lumigraph capture "
-        f"{folder}. Looked for {'; '.join(r.EXPECTED_FILES for r in asked.values())}"
+        f"{folder}. Looked for {'; '.join(map(looked_for, asked.values()))}"
     )
+
+
+def looked_for(reader: ModuleType) -> str:
+    """Sentence part on the files by which a reader recognises a folder, for each program that writes such."""
+    pairs = reader.EXPECTED_FILES.items()
+    return "; ".join(f"{' and '.join(files)} ({program})" if files else program for program, files in pairs)

@@ -27,7 +27,7 @@ BASES = (".", "colmap", "dense", "dense/0", "undistorted")  # folders in which p
 PARTS = ("cameras", "images")  # of a whole model; points are in points3D of the same suffix, or in points3D.ply
 MAX_SIDE = 10**5  # pixels
 IMAGE_WORDS = 10  # of a line of images.txt; the last is the name, and may have spaces
-EXPECTED_FILES = "sparse/0 with cameras and images, .bin or .txt (COLMAP)"
+EXPECTED_FILES = {"COLMAP": ("sparse/0/cameras.*", "sparse/0/images.*")}
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
 PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

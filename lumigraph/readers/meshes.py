@@ -16,7 +16,7 @@ from ..datasets.dataset import splits_of
 from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
-from ..exchange.gltf import plain, refuse_compressed
+from ..exchange.unpacked_gltf import plain
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
 from ..files.reading import reads
@@ -79,9 +79,7 @@ def read_mesh(path: Path) -> Mesh:
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
     suffix, loaded = path.suffix.lower(), None
     if suffix in (".glb", ".gltf"):
-        refuse_compressed(path)
-        beside = trimesh.resolvers.FilePathResolver(str(path))
-        loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb", resolver=beside)
+        loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb")
     elif suffix == ".ply" and not has_texture(path):
         loaded = read_ply(path)
     else:

@@ -31,7 +31,7 @@ from .pictures import reductions, upright_size, versions
 from .points import SparsePoints, read_ply, similarity
 
 RESULT_FILE = "capture.json"  # of a folder that `lumigraph capture` made
-EXPECTED_FILES = "transforms.json (instant-ngp, nerfstudio)"
+EXPECTED_FILES = {"instant-ngp, nerfstudio": ("transforms.json",)}
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
 MAX_FACT_NUMBERS = 10_000  # numbers per fact of one photograph

@@ -175,12 +175,17 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 
 
 def walk(
-    folder: Path, work: Path | None = None, list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir
+    folder: Path,
+    work: Path | None = None,
+    list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir,
+    seen: set[Path] | None = None,
 ) -> Iterator[Path]:
-    """Photographs below a folder, sorted, without hidden ones, masks, and programs' reduced or rendered copies.
+    """Photographs below a folder, sorted, without hidden ones, masks, and programs' reduced or rendered copies. Links
+    to folders are followed, and no folder is entered twice.
 
-    work: a folder to leave out; list_entries: lists the entries of a folder
+    work: a folder to leave out; list_entries: lists the entries of a folder; seen: folders entered so far
     """
+    seen = {folder.resolve()} if seen is None else seen
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
@@ -192,8 +197,9 @@ def walk(
             reduced = REDUCED_FOLDER.fullmatch(entry.name)
             if entry.name.lower() in NO_PHOTOGRAPHS or (reduced and reduced[1] in folders):
                 continue
-            if not entry.is_symlink() and not any(exists(entry / name) for name in PROGRAM_FILES):
-                yield from walk(entry, work, list_entries)
+            if (place := entry.resolve()) not in seen and not any(exists(entry / name) for name in PROGRAM_FILES):
+                seen.add(place)
+                yield from walk(entry, work, list_entries, seen)
         elif (entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry)) and entry.stem not in masks:
             yield entry
 
