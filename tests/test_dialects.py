@@ -8,6 +8,7 @@ import math
 import shutil
 import sys
 import unicodedata
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from lumigraph.exchange.unpacked_gltf import packed, part, unpacked
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
+from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.large import open_any
 from lumigraph.opening import folder_of, kind_of, read_capture
 from lumigraph.readers import choose_reader, colmap, light_field, nerfies, phones, pictures, transforms
@@ -59,7 +61,7 @@ def frames_named(tiny: Tiny, form: str) -> list[dict]:
 @pytest.mark.parametrize(
     "form",
     [r"images\{}", r"C:\Users\me\scan\images\{}", "/home/me/scan/images/{}", "scan/images/{}", "./images/{}", "{}",
-     r"\\server\share\scan\images\{}", "IMAGES/{}", "images/images/{}"],
+     r"\\server\share\scan\images\{}", "IMAGES/{}", "images/images/{}", "file:///home/me/image%73/{}"],
 )  # fmt: skip
 def test_paths_of_other_machines_lead_to_the_photographs(tiny, tmp_path, form):
     folder = write_ngp(tmp_path, tiny, frames=frames_named(tiny, form))
@@ -186,6 +188,45 @@ def test_published_splits_of_dycheck(tiny, tmp_path):
         (folder / "splits" / f"{split}.json").write_text(json.dumps({"frame_names": names, "camera_ids": [0]}))
     found = {shot.name: shot.split for shot in nerfies.read(folder).shots}
     assert found == {name: "test" if name == ids[3] else "train" if name in ids[::2] else "val" for name in ids}
+
+
+def test_models_without_lines_of_features(tiny, tmp_path):
+    folder = write_colmap(tmp_path, tiny, text=True)
+    path = folder / "sparse/0/images.txt"
+    path.write_text("".join(f"{x}\n" for x in path.read_text().splitlines() if x.endswith(".png") or x[0] == "#"))
+    found = colmap.read(folder)
+    assert len(found.shots) == 6 and found.points is not None and len(found.points) == 200
+
+
+def test_fields_that_are_null_count_as_absent(tiny, tmp_path):
+    folder = write_ngp(tmp_path, tiny, camera_model=None, k1=None, ply_file_path=None)
+    assert len(transforms.read(folder).shots) == 6
+
+
+def test_masks_that_are_not_there_are_named_and_cost_nothing(tiny, tmp_path):
+    folder = write_ngp(tmp_path, tiny, mask_path="masks/none.png")
+    found = transforms.read(folder)
+    assert len(found.shots) == 6 and found.missing == ["masks/none.png"] * 6
+    assert all(shot.mask is None for shot in found.shots)
+
+
+def test_transposed_poses_are_refused(tiny, tmp_path):
+    frames = frames_named(tiny, "images/{}")
+    for frame in frames:
+        frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    with pytest.raises(LumigraphError, match="last row is 4, 0, 1, 1, not 0, 0, 0, 1; transpose it"):
+        transforms.read(write_ngp(tmp_path, tiny, frames=frames))
+
+
+def test_a_capture_further_down_and_under_another_name_is_named(tiny, tmp_path):
+    write_ngp(tmp_path / "unpacked" / "scene", tiny)
+    with pytest.raises(LumigraphError, match=r"no camera poses itself, and .*unpacked/scene does"):
+        read_capture(tmp_path)
+    place = tmp_path / "unpacked" / "scene" / "transforms.json"
+    place.rename(place.with_name("cameras_nerf.json"))
+    for path in (place.parent, place.with_name("cameras_nerf.json")):
+        with pytest.raises(LumigraphError, match="under another name, .* name the file transforms.json"):
+            read_capture(path)
 
 
 @pytest.mark.parametrize("file", ["transforms.json", "sparse/0/images.bin", "sparse/0/cameras.txt"])
@@ -522,11 +563,47 @@ def test_several_clouds_are_no_shapes(tmp_path):
     assert kind_of(tmp_path) is Shapes
 
 
+def test_colours_as_bytes_and_one_scale(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    known = [x for x in rows.dtype.names if not x.startswith(("f_", "scale_1", "scale_2"))]
+    other = np.zeros(len(rows), [(x, "<f4") for x in known] + [(x, "u1") for x in ("red", "green", "blue")])
+    for name in known:
+        other[name] = rows[name]
+    other["green"] = 255
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": other}, [])
+    found = read_gaussians(tmp_path / "b.ply")
+    torch.testing.assert_close(found.harmonics[:, 0] * K00 + 0.5, torch.tensor([0.0, 1, 0]).expand(len(rows), 3))
+    torch.testing.assert_close(found.log_scales, cloud().log_scales[:, :1].expand(-1, 3))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [(["f_anchor_feat_0"], "anchors of Scaffold-GS"), (["t", "scale_t"], "4D-GS")]
+)
+def test_clouds_that_need_more_than_their_file_are_named(tmp_path, names, words):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    more = np.zeros(len(rows), rows.dtype.descr + [(name, "<f4") for name in names])
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": more}, [])
+    with pytest.raises(LumigraphError, match=words):
+        read_gaussians(tmp_path / "b.ply")
+
+
+def test_a_zipped_folder_of_sog_opens(tmp_path):
+    write_gaussians(tmp_path / "a.sog", cloud())
+    with zipfile.ZipFile(tmp_path / "a.sog") as old, zipfile.ZipFile(tmp_path / "b.sog", "w") as new:
+        new.writestr("scene/", "")
+        new.writestr("__MACOSX/scene/._meta.json", "")
+        for name in old.namelist():
+            new.writestr(f"scene/{name}", old.read(name))
+    torch.testing.assert_close(read_gaussians(tmp_path / "b.sog").means, read_gaussians(tmp_path / "a.sog").means)
+
+
 def test_harmonics_of_degree_four_are_cut(tmp_path):
     write_gaussians(tmp_path / "a.ply", cloud())
     rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
     known = [name for name in rows.dtype.names if not name.startswith("f_rest_")]
-    more = np.zeros(len(rows), rows[known].dtype.descr + [(f"f_rest_{i}", "<f4") for i in range(72)])
+    more = np.zeros(len(rows), [(x, "<f4") for x in (*known, *(f"f_rest_{i}" for i in range(72)))])
     for name in known:
         more[name] = rows[name]
     for i in range(72):
@@ -603,6 +680,29 @@ def test_a_cloud_of_points_is_described(tmp_path):
     (tmp_path / "a.xyz").write_text("0 0 0")
     with pytest.raises(LumigraphError, match="convert it to"):
         choose_reader(tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize("line", ["-s 1 1 1 tex\\a b.png", r"C:\Users\me\A B.png", "none.png"])
+def test_textures_are_found_as_photographs_are(tmp_path, line):
+    (tmp_path / "tex").mkdir()
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(tmp_path / ("tex" if "tex" in line else ".") / "a b.png")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 1 1 1\nmap_Kd {line}\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib m.mtl\n{corners}usemtl a\nf 1/1 2/2 3/3\n")
+    if line == "none.png":
+        with pytest.warns(LumigraphWarning, match="names none.png, which is not beside it"):
+            read_mesh(tmp_path / "a.obj")
+    else:
+        assert (read_mesh(tmp_path / "a.obj").colours == [255, 0, 0]).all()
+
+
+def test_strips_of_triangles(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {x}\n" for x in "xyz")
+    head += "".join(f"property uchar {x}\n" for x in "rgb") + "element tristrips 1\n"
+    rows = "0 0 0 9 0 0\n1 0 0 9 0 0\n0 1 0 9 0 0\n1 1 0 9 0 0\n9 0 1 2 3 -1 1 3 2 -1\n"
+    (tmp_path / "a.ply").write_text(f"{head}property list int int vertex_indices\nend_header\n{rows}")
+    found = read_mesh(tmp_path / "a.ply")
+    assert len(found.faces) == 3 and (found.colours == [9, 0, 0]).all()
 
 
 # Red above, blue below, 8 x 8 pixels of ETC1S

@@ -187,7 +187,7 @@ def refuse_several(folder: Path) -> None:
     if splats and not any(file.suffix.lower() in SURFACES for file in {*found} - {*splats}):
         raise LumigraphError(
             f"{folder} holds {counted(len(splats), 'file')} of Gaussians, such as {splats[0].name}; name one, or "
-            "several in `lumigraph compose`; frames of a moving cloud are numbered .ply files without others beside them"
+            "several in `lumigraph compose`; frames of a moving cloud are numbered .ply files alone"
         )
 
 

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 from ..files import is_file
 from .pictures import find_file
@@ -21,11 +22,12 @@ def find_named(folder: Path, name: str) -> Path:
 
     Looked for in turn: the name as it is; its end, from the longest on, below the folder and its folders of
     photographs; the same in other letters (upper and lower case, composed and decomposed accents), and with other signs
-    between letters and digits, as programs replace spaces and brackets.
+    between letters and digits, as programs replace spaces and brackets. Signs of a link (%20) are undone.
     """
     exact = find_file(folder / name)
     if is_file(exact):
         return exact
+    name = unquote(name)
     parts = PurePosixPath(name.replace("\\", "/")).parts
     parts = tuple(part for part in parts if part not in ("/", ".", "..") and not part.endswith(":"))
     ends = [parts[i:] for i in range(len(parts))]
