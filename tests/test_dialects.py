@@ -40,7 +40,7 @@ from lumigraph.readers.finding import find_named, paired
 from lumigraph.readers.meshes import read_mesh
 from lumigraph.readers.numbers import kind_of as kind_of_numbers
 from lumigraph.readers.numbers import read_numbers
-from lumigraph.readers.pictures import find_file, read_image
+from lumigraph.readers.pictures import find_file, read_image, read_mask
 from lumigraph.sfm.photos.gather import gather, is_bare, left_out_films, lone_film, walk
 from lumigraph.system.cache import cache_folder, temporary_cache
 
@@ -208,6 +208,37 @@ def test_masks_that_are_not_there_are_named_and_cost_nothing(tiny, tmp_path):
     found = transforms.read(folder)
     assert len(found.shots) == 6 and found.missing == ["masks/none.png"] * 6
     assert all(shot.mask is None for shot in found.shots)
+
+
+BLACK = np.zeros((HEIGHT, WIDTH), np.uint8)
+HALF = np.repeat(np.arange(2, dtype=np.uint8), WIDTH // 2)[None].repeat(HEIGHT, 0)
+
+
+@pytest.mark.parametrize(
+    ("picture", "share"),
+    [
+        (HALF, 0.5),
+        (np.dstack([BLACK, BLACK, BLACK, 255 * HALF]), 0.5),
+        (255 * HALF, 0.5),
+        (257 * 255 * HALF.astype(np.uint16), 0.5),
+    ],
+)
+def test_masks_of_ones_and_masks_in_alpha(tiny, tmp_path, picture, share):
+    folder = write_ngp(tmp_path, tiny)
+    (folder / "Masks").mkdir()
+    for name in tiny.names:
+        Image.fromarray(picture).save(folder / "Masks" / name)
+    masks = [shot.mask for shot in read_capture(folder).shots]
+    assert {read_mask(mask, (WIDTH, HEIGHT), True).mean() for mask in masks} == {share}
+
+
+def test_thumbnails_of_a_nas_and_of_macos_are_no_photographs(tmp_path):
+    unseen = "@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg", "__MACOSX/._a.jpg", "__MACOSX/b.jpg", ".thumbs/c.jpg"
+    for place in (*unseen, "a.jpg", "a.mask.png"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (4, 4)).save(tmp_path / place)
+    assert pictures.list_images(tmp_path) == ["a.jpg", "a.mask.png"]
+    assert [path.name for path in walk(tmp_path)] == ["a.jpg"]
 
 
 def test_transposed_poses_are_refused(tiny, tmp_path):
@@ -748,6 +779,14 @@ def packed_ball(path: Path, how: str) -> dict:
     about["buffers"][0] = {"byteLength": len(whole)}
     path.write_bytes(packed(about, whole))
     return about
+
+
+def test_a_gltf_without_scenes_is_the_scene_of_its_nodes(tmp_path):
+    write_mesh(tmp_path / "a.glb", BALL, np.array([0.0, 1, 0]))
+    about, whole = unpacked(tmp_path / "a.glb")
+    del about["scenes"], about["scene"]
+    (tmp_path / "a.glb").write_bytes(packed(about, whole))
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.glb").vertices, BALL.vertices, atol=1e-6)
 
 
 @pytest.mark.parametrize("how", ["draco", "EXT", "KHR"])

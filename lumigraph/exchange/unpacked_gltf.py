@@ -84,6 +84,11 @@ def unpacked(path: Path) -> tuple[dict[str, Any], bytearray]:
         uri = image.pop("uri", None)
         if uri is not None and (uri.startswith("data:") or (path.parent / unquote(uri)).is_file()):
             image["bufferView"] = part(about, whole, linked(path, uri))
+    nodes = about.get("nodes", [])
+    if nodes and not about.get("scenes"):  # which a file may leave out
+        inner = {child for node in nodes for child in node.get("children", [])}
+        about["scenes"] = [{"nodes": [i for i in range(len(nodes)) if i not in inner]}]
+    about.setdefault("scene", 0)
     for texture in about.get("textures", []):
         sources = (x["source"] for x in texture.get("extensions", {}).values() if "source" in x)
         texture |= {"source": texture.get("source", next(sources, None))}

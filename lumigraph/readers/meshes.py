@@ -137,7 +137,7 @@ def read_ply(path: Path) -> Any:
     rows = read_vertices(path, "face", "tristrips")
     vertices, faces = rows["vertex"], rows.get("face", np.empty(0, []))
     positions, colours = np.array(columns(vertices, "xyz", np.float64)), ply_colours(vertices)
-    if len(strips := rows.get("tristrips", ())):
+    if (strips := rows.get("tristrips")) is not None and len(strips):
         corners = np.concatenate([np.asarray(x) for x in strips[POLYGONS[0]]])
         parts = np.split(corners, np.flatnonzero(corners < 0))
         triangles = trimesh.util.triangle_strips_to_faces([x for part in parts if len(x := part[part >= 0]) > 2])

@@ -21,7 +21,7 @@ from ...files.names import counted, natural
 from ...files.reading import reason_of
 from ...readers.exif import read_facts
 from ...readers.masks import LABELS, MASKS, OBJECT_MASKS, OTHER_MASKS, PLANES, find_mask, names_beside
-from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
+from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, UNSEEN, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
@@ -191,7 +191,7 @@ def walk(
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
     masks = {name for entry in entries for name in names_beside(entry.stem)}
     for entry in entries:
-        if entry.name.startswith(".") or (work is not None and entry.resolve() == work):
+        if entry.name.lower().startswith(UNSEEN) or (work is not None and entry.resolve() == work):
             continue
         if entry.name in folders:
             reduced = REDUCED_FOLDER.fullmatch(entry.name)
