@@ -69,6 +69,13 @@ def test_paths_of_other_machines_lead_to_the_photographs(tiny, tmp_path, form):
     assert len(found.shots) == 6 and not found.missing
 
 
+def test_a_link_that_was_copied_as_text_leads_to_its_folder(tiny, tmp_path):
+    folder = write_ngp(tmp_path / "scene", tiny, frames=frames_named(tiny, "/home/me/scan/images/{}"))
+    (folder / "images").rename(tmp_path / "photographs")
+    (folder / "images").write_text("../photographs")
+    assert len(transforms.read(folder).shots) == 6
+
+
 def test_names_in_other_letters(tmp_path):
     name = "Stra\u00dfe caf\u00e9 (1).JPG"
     (tmp_path / "images").mkdir()

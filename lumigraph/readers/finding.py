@@ -13,6 +13,7 @@ from urllib.parse import unquote
 from ..files import is_file
 from .pictures import find_file
 
+MAX_LINK_BYTES = 255  # of the text of a link
 NO_LETTERS = re.compile(r"[\W_]+")
 PHOTOGRAPH_FOLDERS = ("images", "input", "image", "rgb", "photos")  # where photographs lie below a scene
 
@@ -31,7 +32,8 @@ def find_named(folder: Path, name: str) -> Path:
     parts = PurePosixPath(name.replace("\\", "/")).parts
     parts = tuple(part for part in parts if part not in ("/", ".", "..") and not part.endswith(":"))
     ends = [parts[i:] for i in range(len(parts))]
-    places = [folder, *(folder / inner for inner in PHOTOGRAPH_FOLDERS if (folder / inner).is_dir())]
+    inner = (as_folder(folder / one) for one in PHOTOGRAPH_FOLDERS)
+    places = [folder, *(one for one in inner if one.is_dir())]
     for end in ends:
         for place in places:
             if is_file(found := find_file(place.joinpath(*end))):
@@ -42,6 +44,14 @@ def find_named(folder: Path, name: str) -> Path:
                 if (other := in_other_form(place, end, form)) is not None:
                     return other
     return exact
+
+
+def as_folder(path: Path) -> Path:
+    """The folder to which a link leads that was copied as text, as git and archives do on Windows; else the path."""
+    if path.is_file() and path.stat().st_size <= MAX_LINK_BYTES:
+        target = path.parent / path.read_text("utf-8", "replace").strip()
+        return target if target.is_dir() else path
+    return path
 
 
 def in_other_form(folder: Path, parts: tuple[str, ...], form: Callable[[str], str]) -> Path | None:
