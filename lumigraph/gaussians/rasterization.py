@@ -125,7 +125,7 @@ def rasterization(
     for i in range(count):
         values = [colours(colors, means, viewmats[i], i, sh_degree)] if "RGB" in render_mode else []
         own = torch.cat([*values, means.new_zeros(len(means), 0)], -1)[rows[i]]
-        picture, depth, alpha = composited(*(part[i] for part in parts), own, (width, height))
+        picture, depth, alpha = composited(*(part[i] for part in parts), values=own, size=(width, height))
         if backgrounds is not None:
             picture = over(picture, alpha, backgrounds[i])
         if "ED" in render_mode:
