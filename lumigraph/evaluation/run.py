@@ -18,7 +18,9 @@ from ..datasets.world import BlockWorld
 from ..errors import LumigraphError, LumigraphWarning
 from ..figures import save_picture
 from ..files import claim, refuse_link, scene_name, write_json
+from ..gaussians.cloud import needle_share
 from ..method import Method
+from ..method.capabilities import HasGaussians, can, needs
 from ..metrics import Score
 from ..metrics.lpips import Lpips, load_lpips, named_files
 from ..run import Trained
@@ -26,6 +28,7 @@ from ..system.progress import counting
 from .baseline import below
 from .options import EvaluationOptions
 from .shapes import ShapesEvaluation, evaluate_shapes
+from .tracking import Followed, tracks
 from .views import ViewsEvaluation, evaluate, file_name, reveal
 from .walks import evaluate_walk
 from .words import evaluate_words
@@ -99,6 +102,15 @@ def evaluate_run(
         "evaluated_on": str(method.device),
         "versions": run.settings.versions,
     }
+    if can(method, HasGaussians):
+        cloud = needs(method, HasGaussians).gaussians()
+        result["cloud"] = {"gaussians": len(cloud), "needles": needle_share(cloud)}
+    if tracks(method):
+        assert isinstance(data, Scene)
+        followed = Followed.of(method, data)
+        result["tracking"] = {"frames": followed.frames, "known": followed.known, "share": str(followed)}
+        if followed.sentence:
+            warnings.warn(followed.sentence, LumigraphWarning, stacklevel=2)
     figures = [f"{score.name} {score}" for score in found.scores]
     title = " · ".join([run.method_name, scene_name(run.settings.scene.source), found.compared, *figures])
     with counting("Drawing the contact sheet"):
