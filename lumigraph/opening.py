@@ -4,8 +4,6 @@ Photographs become a Scene, meshes are Shapes, folders of either a Collection; a
 scenes have kinds of their own.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Open trained or exported models: runs of one field or in blocks, splat files, SNeRG folders and compositions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..errors import LumigraphError
