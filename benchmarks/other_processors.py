@@ -4,7 +4,8 @@
 
 Each kernel runs its typical case once, forward, so that Numba compiles it, without the optimisation that is this
 processor's own; LLVM optimises and translates the code for the other one. The table has instructions of vectors and of
-all kinds. It is a check that the code exists and is not scalar; speed needs such a machine.
+all kinds, and those that calculate with vectors. It is a check that the code exists and is not scalar; speed needs such
+a machine.
 
     python benchmarks/other_processors.py [KERNEL...] --plain FOLDER [--scene SCENE]
 
@@ -38,6 +39,9 @@ REPEATS = 9
 ONE_THREAD = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 HOST = re.compile(r'"(target-cpu|target-features)"="[^"]*"')
 VECTOR = re.compile(r"^\s+\w+\s+.*\bv\d+\.(?:2d|4s|8h|16b)", re.MULTILINE)
+ARITHMETIC = re.compile(
+    r"^\s+f?(?:add|sub|mul|mla|mls|div|sqrt|max|min|cvt\w*)\w*\s+v\d+\.(?:2d|4s|2s|8h)", re.MULTILINE
+)
 INSTRUCTION = re.compile(r"^\t[a-z]\w*(?:\.\w+)?\s", re.MULTILINE)
 
 
@@ -119,7 +123,7 @@ def main() -> None:
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     machine = llvm.Target.from_triple(said.triple).create_target_machine(opt=3)
-    print("| kernel | functions | instructions | of vectors |\n|---|---|---|---|")
+    print("| kernel | functions | instructions | of vectors | arithmetic of vectors |\n|---|---|---|---|---|")
     for name in said.kernels:
         place = importlib.import_module(f"lumigraph.kernels.{name}")
         cpu, cases = (
@@ -128,13 +132,14 @@ def main() -> None:
         )
         with kernels.using("cpu"), torch.no_grad():
             getattr(kernels, name)(*list(cases)[place.FACTS.typical])
-        functions = instructions = vectors = 0
+        functions = instructions = vectors = sums = 0
         for function in (x for x in vars(cpu).values() if isinstance(x, Dispatcher)):
             for code in function.inspect_llvm().values():
                 text = translated(code, machine, said.triple)
                 functions, instructions = functions + 1, instructions + len(INSTRUCTION.findall(text))
-                vectors += len(VECTOR.findall(text))
-        print(f"| `{name}` | {functions} | {instructions} | {100 * vectors / max(instructions, 1):.0f} % |", flush=True)
+                vectors, sums = vectors + len(VECTOR.findall(text)), sums + len(ARITHMETIC.findall(text))
+        share = f"{100 * vectors / max(instructions, 1):.0f} %"
+        print(f"| `{name}` | {functions} | {instructions} | {share} | {sums} |", flush=True)
 
 
 if __name__ == "__main__":
