@@ -99,7 +99,8 @@ def compare(names: list[str], place: Path, scene: str | None) -> None:
     print("| | forward | backward |\n|---|---|---|")
     for name in names:
         both = zip(own[name], plain[name], again[name], strict=True)
-        print(f"| `{name}` | {' | '.join(f'{slow / min(a, b):.2f}' for a, slow, b in both)} |", flush=True)
+        ratios = [f"{slow / min(a, b):.2f}" for a, slow, b in both]
+        print(f"| `{name}` | {' | '.join([*ratios, ''][:2])} |", flush=True)
     for method in ("gaussian-splatting", "instant-ngp") if scene else ():
         words = ["-m", "lumigraph", "bench", "step", method, str(scene), "--warmup", "40", "--steps", "20", "--output"]
         own, plain = (figures(words, place, x)["processor_ms"] for x in (False, True))
