@@ -26,8 +26,8 @@ from ..components.image_based.depth import hull_surface, mesh_distance, shape
 from ..datasets.mesh import Mesh, MeshTexture
 from ..datasets.scene import Frame, Photograph, Scene
 from ..errors import LumigraphError
-from ..files.ranges import Count, LearningRate, NonNegative, Seed, Width, between
-from ..method import Method
+from ..files.ranges import Count, LearningRate, NonNegative, Width, between
+from ..method import BaseConfig, Method
 from ..method.controls import Control, moment
 from ..system.progress import track
 from ..system.work import at_work
@@ -46,7 +46,7 @@ MESH_WEIGHT = 1.0  # lambda_M of the loss
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the release, facebookresearch/multiface, models.py and train.py; its codes of 128 are the paper's."""
 
     texture_log2: Annotated[int, between(4, 10)] = 10  # side of the texture, log2; higher: finer, slower
@@ -60,7 +60,6 @@ class Config:
     mesh_columns: Annotated[int, between(5, 512)] = 101  # of the mesh's grid
     textures_per_step: Count = 16  # textures of a step; more are steadier, and cost time
     learning_rate: LearningRate = 3e-4  # Adam's learning rate
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)

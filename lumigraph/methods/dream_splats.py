@@ -24,16 +24,16 @@ from ..components.guidance import (
 )
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import CloudSize, PositiveShare, Seed, changed
+from ..files.ranges import CloudSize, PositiveShare, changed
 from ..gaussians import Gaussians
 from ..gaussians.splatting import render, splat, view_of
-from ..method import Method
+from ..method import BaseConfig, Method
 
 GREY = 0.5  # colour of all Gaussians at first
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Tang 2024, section 3.1 and the released code (configs/text.yaml)."""
 
     rates: RateNumbers = RateNumbers(
@@ -43,7 +43,6 @@ class Config:
     distillation: DistillationNumbers = DistillationNumbers()
     initial_gaussians: CloudSize = 5000  # Gaussians of the cloud, whose number stays; more hold finer detail
     initial_radius: PositiveShare = 0.5  # radius of the ball that they fill at first, in scene units
-    seed: Seed = 0  # seed of all random numbers; another seed gives another scene
 
 
 class DreamSplats(Method):

@@ -22,15 +22,15 @@ from ...components.sampling.surface_method import SHADINGS, SurfaceMethod
 from ...components.training.schedules import BandSchedule, exponential_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...method import seeded
+from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Share, Width, between
+from ...method import BaseConfig, seeded
 from .fields import LOGIT_SCALE, OccupancyField, TableField
 
 MarchSteps = Annotated[int, between(4, 4096)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The numbers of the paper's multi-view reconstruction, as its published code has them (configs/)."""
 
     table: TableNumbers = TableNumbers()
@@ -48,7 +48,6 @@ class Config:
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 2.5e-5  # learning rate at the end of the budget, reached exponentially
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

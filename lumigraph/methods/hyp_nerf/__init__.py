@@ -26,9 +26,9 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Share, Width, between
 from ...geometry import look_at, turning
-from ...method import Method, RayMethod, seeded
+from ...method import BaseConfig, Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.up import common_up
@@ -45,7 +45,7 @@ DENOISER_WIDTH = 32  # channels of the denoiser, section 3.3
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
 
     table: HashNumbers = HashNumbers(log2_hashmap_size=11)  # of an object
@@ -73,7 +73,6 @@ class Config:
     tune_steps: Tally = 60  # steps that tune the field to the photographs, section 3.3; 0: code alone
     denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from ...datasets.mesh import Mesh
 from ...datasets.scene import Frame, Photograph, Scene
 from ...depth_maps import TSDF, Tolerance, fused_colours, render_depth_maps
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, Seed, Share, between
-from ...method import Method
+from ...files.ranges import LearningRate, NonNegative, Share, between
+from ...method import BaseConfig, Method
 from ...method.capabilities import HasMesh, can, needs
 from ...system.work import at_work
 from .optimizer import UniformAdam
@@ -34,7 +34,7 @@ from .surface import MeshSurface, face_normals, remeshed, vertex_normals
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the paper's experiments; colours and weights of terms are ours, for it fits to shaded pictures."""
 
     start: Literal["sphere", "hull"] = "sphere"  # first mesh: a sphere, or the hull of the photographs' silhouettes
@@ -50,7 +50,6 @@ class Config:
     mask_weight: NonNegative = 1.0  # of the silhouettes' absolute error
     laplacian_weight: NonNegative = 0.0  # of |L x|^2 over squared edges; larger is smoother
     normal_weight: NonNegative = 0.0  # of 1 - cosine between neighbours' normals; larger is flatter
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
