@@ -15,6 +15,7 @@ from lumigraph.camera.rays import Rays, Samples
 from lumigraph.commands.cli import main
 from lumigraph.components.tracking.frames import DepthFrame
 from lumigraph.components.tracking.trajectory import LOST
+from lumigraph.errors import LumigraphWarning
 from lumigraph.method import Pass
 from lumigraph.methods.imap import REGIONS, IMap
 from lumigraph.run import Run, build
@@ -134,7 +135,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_trajectory(room):
     np.testing.assert_allclose(one, other, atol=1e-6)
 
 
-def test_a_lost_frame_is_told_and_left_out(room, capsys):
+def test_a_lost_frame_is_told_and_left_out(room, capsys, recwarn):
     """A frame that the map explains nothing of keeps the last known pose, and has none in the file."""
     from lumigraph.commands.outcome import show_tracking
     from lumigraph.training.loop import Outcome
@@ -143,6 +144,9 @@ def test_a_lost_frame_is_told_and_left_out(room, capsys):
     method, scene = run.method(), run.scene()
     method.tracker.trajectory.state[3] = LOST
     show_tracking(run, Outcome(run.state, True), method, scene)
-    told = capsys.readouterr().out
-    assert scene.names[3] in told and "kept" in told
+    told = capsys.readouterr()
+    said = f"followed 7 of 8 frames (88 %) and lost the camera at {scene.names[3]}, where too few of its features"
+    assert "frames followed" in told.out and said in str(recwarn.pop(LumigraphWarning).message)
+    about = json.loads((run.folder / "tracking.json").read_text())
+    assert about["share"] == 7 / 8 and said in about["warnings"][0]
     assert len((run.folder / "trajectory.txt").read_text().splitlines()) == len(scene)

@@ -17,13 +17,21 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.components.tracking.alignment import aligned
 from lumigraph.components.tracking.frames import DepthFrame, Moment
-from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
+from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion
 from lumigraph.components.tracking.tracker import Tracker, TrackingNumbers
-from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, apply_twists, relative, rigid
-from lumigraph.components.training.shared_points import Seen
+from lumigraph.components.tracking.trajectory import (
+    CONTRADICTED,
+    KNOWN,
+    LOST,
+    Trajectory,
+    apply_twists,
+    relative,
+    rigid,
+)
+from lumigraph.components.training.shared_points import Seen, resected
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation.tracking import Tracked
+from lumigraph.evaluation.tracking import Followed, Tracked
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
 from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.readers.unposed import Unposed
@@ -149,17 +157,50 @@ def place(points: torch.Tensor, pose: torch.Tensor, descriptors: torch.Tensor) -
 
 
 def test_a_place_is_recognised_by_a_motion_that_its_points_agree_on():
-    """A third of the matches are wrong in depth. The motion is exact; two places of other things have none."""
+    """A third of the points are wrong. The motion is exact; two places of other things have none."""
     chance = torch.Generator().manual_seed(0)
     points = corner(90, 1)
     descriptors = torch.nn.functional.normalize(torch.randn(90, 128, generator=chance), dim=-1)
     first, second = (torch.from_numpy(pose).float() for pose in walk(9)[[0, 8]])
     one, other = place(points, first, descriptors), place(points, second, descriptors)
-    other.points[:30] += 0.3
-    found = motion_between(one, other, 0.05, chance)
+    one.points[:20] += 0.3
+    one.points[20:30] = torch.nan
+    found = resected(*one.matched_points(other), 25)
     assert found is not None
     torch.testing.assert_close(found, motion(first, second), atol=1e-4, rtol=0)
-    assert motion_between(one, place(corner(90, 2), second, descriptors), 0.05, chance) is None
+    assert resected(*one.matched_points(place(corner(90, 2), second, descriptors)), 25) is None
+
+
+@pytest.mark.parametrize("metres", [0.0, 0.1, 0.25])
+def test_depth_of_few_levels_is_as_uncertain_as_their_distance(metres):
+    """Levels 10 or 25 cm apart, as of eight bits or less; and depth of millimetres, whose deviation is a sensor's."""
+    pose = steps(1, (0.0,) * 6)[0]
+    exact = in_room(0, pose)
+    axis = exact.rays.directions[:, 2]
+    step = metres or 0.001
+    frame = replace(exact, depth=(exact.depth * axis / step).round() * step / axis)
+    if metres:
+        assert float((frame.step / metres - 1).abs().quantile(0.9)) < 0.01
+        assert float(frame.deviation.median()) == pytest.approx(max(metres / 12**0.5, 0.01), rel=0.05)
+    else:
+        assert not frame.step.any() and float(frame.deviation.max()) < 0.03
+    moved = torch.cat([pose[:, :3], pose[:, 3:] + torch.tensor([[0.05], [0.0], [0.02]])], 1)
+    other = in_room(1, moved)
+    assert frame.compared(other, motion(moved, pose)).agrees
+
+
+@pytest.mark.parametrize("lost", [[], [3], [2, 3, 7]])
+def test_where_the_camera_was_lost_is_said(lost):
+    state = torch.full((10,), KNOWN)
+    state[lost] = CONTRADICTED
+    state[9] = 0  # not tracked yet
+    method = SimpleNamespace(tracker=SimpleNamespace(trajectory=SimpleNamespace(state=state)))
+    lens = Pinhole(torch.ones(10, 2), torch.ones(10, 2))
+    cameras = Camera(torch.eye(3, 4).repeat(10, 1, 1), lens, SIZE.repeat(10, 1))
+    found = Followed.of(method, Mock(spec=Scene, cameras=cameras, names=[f"f{i}" for i in range(10)]))
+    assert str(found) == f"{9 - len(lost)} of 9 frames ({100 * (9 - len(lost)) / 9:.0f} %)"
+    places = {0: "", 1: "at f3, where its depth contradicts", 3: "at f2 to f3, where its depth contradicts"}
+    assert places[len(lost)] in found.sentence and bool(found.sentence) == bool(lost)
 
 
 def test_a_loop_spreads_the_drift():

@@ -1,7 +1,5 @@
 """The app's server: routes, and the viewer's guard in front of all of them. State is in files only."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import io

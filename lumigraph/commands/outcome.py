@@ -24,7 +24,6 @@ SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # 
 FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
 MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
 MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
-MAX_LOST_NAMES = 5  # of lost frames that are named
 WORST_VIEWS = 2  # held-out views that are named
 OTHER_METHODS = "instant-ngp", "gaussian-splatting"  # of which the other is suggested for comparison
 ABOUT_RESIDUALS = "small renderings, each after a gain and an offset per colour"
@@ -82,7 +81,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
 
 def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
     """Write the trajectory of a run and print its errors, lost frames and next commands."""
-    from ..evaluation.tracking import DRIFT_FILE, PATH_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
+    from ..evaluation.tracking import DRIFT_FILE, PATH_FILE, TRAJECTORY_FILE, Followed, mapping_scores, write_tracking
 
     state, sequence = outcome.state, method.tracker.sequence(data)
     followed = min(state.step, len(sequence))
@@ -96,15 +95,10 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     found = write_tracking(run, method, data, figures, mapped)
     if not outcome.finished:
         say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
-    rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
+    rows["frames followed"] = str(Followed.of(method, data))
+    rows["trajectory"] = str(run.folder / TRAJECTORY_FILE)
     rows |= {"path": str(run.folder / PATH_FILE)} if found.map else {}
-    if found.lost:
-        names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
-        more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""
-        rows["lost"] = (
-            f"tracking failed at {names}{more}; these frames have no pose in {TRAJECTORY_FILE}, and the map holds "
-            "nothing of them; the map and all other poses are kept"
-        )
+    rows |= {"loops closed": str(len(found.loops))} if method.tracker.loops is not None else {}
     if (errors := found.errors) is not None:
         rows |= {score.name: str(score) for score in errors.scores}
         rows["drift"] = f"{run.folder / DRIFT_FILE}, {100 * errors.largest:.2f} cm at most in {errors.path:.2f} m"

@@ -1,7 +1,5 @@
 """Evaluate a run or a collection under the protocol for its kind of dataset, and write the results."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,6 +28,7 @@ from ..system.progress import counting
 from .baseline import below
 from .options import EvaluationOptions
 from .shapes import ShapesEvaluation, evaluate_shapes
+from .tracking import Followed, tracks
 from .views import ViewsEvaluation, evaluate, file_name, reveal
 from .walks import evaluate_walk
 from .words import evaluate_words
@@ -106,6 +105,12 @@ def evaluate_run(
     if can(method, HasGaussians):
         cloud = needs(method, HasGaussians).gaussians()
         result["cloud"] = {"gaussians": len(cloud), "needles": needle_share(cloud)}
+    if tracks(method):
+        assert isinstance(data, Scene)
+        followed = Followed.of(method, data)
+        result["tracking"] = {"frames": followed.frames, "known": followed.known, "share": str(followed)}
+        if followed.sentence:
+            warnings.warn(followed.sentence, LumigraphWarning, stacklevel=2)
     figures = [f"{score.name} {score}" for score in found.scores]
     title = " · ".join([run.method_name, scene_name(run.settings.scene.source), found.compared, *figures])
     with counting("Drawing the contact sheet"):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,9 @@ from jaxtyping import Float
 
 from .. import files
 from ..components.tracking.frames import order_of
-from ..components.tracking.trajectory import KNOWN, LOST
+from ..components.tracking.trajectory import KNOWN, LOSSES, UNKNOWN
 from ..datasets.scene import Scene
+from ..errors import LumigraphWarning
 from ..figures.charts import Series, line_chart, standalone
 from ..geometry import evenly
 from ..method import Method
@@ -26,6 +29,8 @@ MAPPED_VIEWS = 8  # held-out frames at which a map is compared
 TRAJECTORY_FILE, TRUTH_FILE, ERRORS_FILE = "trajectory.txt", "truth.txt", "tracking.json"
 DRIFT_FILE, PATH_FILE = "drift.svg", "path.svg"
 MIN_POSES = 3  # frames that errors are measured on
+MAX_STRETCHES = 3  # of lost frames that are named, the longest
+MAX_ATE = 0.01  # of the path, beyond which it is called inaccurate
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,8 @@ class Tracked:
         known = None if truth is None else truth[chosen].double().numpy()
         poses = cameras.pose.double().cpu().numpy()
         loops = [] if method.tracker.loops is None else method.tracker.loops.pairs.tolist()
-        return Tracked(chosen.tolist(), order[state[order] == LOST].tolist(), moments, poses, known, loops)
+        lost = [i for i in order.tolist() if int(state[i]) in LOSSES]
+        return Tracked(chosen.tolist(), lost, moments, poses, known, loops)
 
     @property
     def errors(self) -> TrajectoryErrors | None:
@@ -102,6 +108,52 @@ class Tracked:
         return line_chart(curves, "metres", "metres", smoothed=False, equal=True)
 
 
+@dataclass(frozen=True)
+class Followed:
+    """Frames that tracking has seen, and those that it followed. sentence: where and why others were lost, or empty"""
+
+    frames: int
+    known: int
+    sentence: str
+
+    def __str__(self) -> str:
+        return f"{self.known} of {self.frames} frames ({100 * self.known / max(self.frames, 1):.0f} %)"
+
+    @staticmethod
+    def of(method: Any, scene: Scene) -> Followed:
+        state, names = method.tracker.trajectory.state.tolist(), scene.names
+        seen = [i for i in order_of(scene.cameras).tolist() if state[i] != UNKNOWN]
+        lost = [list(some) for known, some in groupby(seen, lambda i: state[i] == KNOWN) if not known]
+        found = Followed(len(seen), len(seen) - sum(map(len, lost)), "")
+        if not lost:
+            return found
+        named = sorted(sorted(lost, key=len, reverse=True)[:MAX_STRETCHES], key=lambda x: seen.index(x[0]))
+        parts = [
+            f"{names[x[0]]}{f' to {names[x[-1]]}' if len(x) > 1 else ''}, where {LOSSES[state[x[0]]]}" for x in named
+        ]
+        more = f"; and {len(lost) - len(named)} shorter times" if len(lost) > len(named) else ""
+        return replace(
+            found,
+            sentence=f"Tracking followed {found} and lost the camera at {'; at '.join(parts)}{more}; lost frames have "
+            "no pose and are not mapped, and errors are those of the others; record more frames where it turns or "
+            "moves fast, and less of plain walls",
+        )
+
+
+def inaccurate(found: Tracked, names: Sequence[str]) -> str:
+    """Sentence for a path whose error is above MAX_ATE of its length; empty for another, or without truth."""
+    errors = found.errors
+    if errors is None or errors.ate <= MAX_ATE * errors.path:
+        return ""
+    assert found.truth is not None
+    worst = names[found.images[int(position_errors(found.poses, found.truth).argmax())]]
+    return (
+        f"The path that was found is off by {100 * errors.ate:.2g} cm, {100 * errors.ate / errors.path:.2g} % of its "
+        f"length, and by {100 * errors.largest:.2g} cm at {worst}; record more frames a second, or try --close-loops "
+        "where the camera returns to a place"
+    )
+
+
 def tracks(method: Method) -> bool:
     """True for a method that tracks poses: see `lumigraph track`."""
     tracking = getattr(method.config, "tracking", None)
@@ -141,8 +193,12 @@ def write_tracking(
     """
     found = Tracked.of(method, scene)
     files.write_bytes(run.folder / TRAJECTORY_FILE, to_tum(found.moments, found.poses).encode(), ours=True)
+    followed = Followed.of(method, scene)
     about: dict[str, Any] = {"frames": len(scene), "known": len(found.images)} | figures
-    about["lost"] = [scene.names[i] for i in found.lost]
+    about |= {"share": len(found.images) / len(scene), "lost": [scene.names[i] for i in found.lost]}
+    about["warnings"] = [sentence for sentence in (followed.sentence, inaccurate(found, scene.names)) if sentence]
+    for sentence in about["warnings"]:
+        warnings.warn(sentence, LumigraphWarning, stacklevel=2)
     if found.map:
         files.write_bytes(run.folder / PATH_FILE, standalone(found.map), ours=True)
     if (errors := found.errors) is not None:

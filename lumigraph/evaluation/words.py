@@ -1,7 +1,5 @@
 """Evaluate a text-to-3D scene: views not used in training, scored by the guidance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,10 +24,11 @@ SHOWN = 4  # views of the contact sheet
 
 @dataclass(frozen=True)
 class WordsEvaluation:
-    """Agreement with the prompt. shown: some of the views"""
+    """Agreement with the prompt. shown: some of the views; empty: agreement of the background alone"""
 
     prompt: str
     score: Score
+    empty: float
     protocol: dict[str, Any]
     shown: list[Float[Tensor, "height width 3"]]
 
@@ -42,7 +41,8 @@ class WordsEvaluation:
         return f"{self.protocol['renderings']} renderings"
 
     def to_json(self) -> dict[str, Any]:
-        return {"scores": [self.score.to_json()], "protocol": self.protocol, "prompt": self.prompt}
+        about = {"scores": [self.score.to_json()], "baselines": {"empty view": self.empty}}
+        return about | {"protocol": self.protocol, "prompt": self.prompt}
 
     def contact_sheet(self, title: str) -> Image.Image:
         """Views from four sides."""
@@ -71,4 +71,6 @@ def evaluate_words(method: Method, words: Words, views: int | None = None) -> Wo
         "judge": str(words.guidance),
     }
     shown = [picture.cpu() for picture in pictures[:: max(1, count // SHOWN)][:SHOWN]]
-    return WordsEvaluation(words.prompt, guide.score(small, words.prompt), protocol, shown)
+    nothing = words.frame.background.to(small)[:, None, None].expand_as(small[:1])
+    empty = guide.score(nothing, words.prompt).value
+    return WordsEvaluation(words.prompt, guide.score(small, words.prompt), empty, protocol, shown)

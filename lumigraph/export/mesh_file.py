@@ -1,7 +1,5 @@
 """Mesh files: PLY, OBJ, GLB and USDZ, each with colours or texture in the form that most programs read."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -213,11 +211,7 @@ def glb(file: MeshFile) -> Parts:
             {
                 "name": "source",
                 "primitives": [
-                    {
-                        "attributes": {name: i for i, name in enumerate(columns)},
-                        "indices": len(columns),
-                        "material": 0,
-                    }
+                    {"attributes": {name: i for i, name in enumerate(columns)}, "indices": len(columns), "material": 0}
                 ],
             }
         ],

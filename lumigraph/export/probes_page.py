@@ -1,7 +1,5 @@
 """Web page with a draggable mesh lit by probes, in a rendered picture with depth."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from dataclasses import asdict

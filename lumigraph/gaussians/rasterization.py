@@ -3,8 +3,6 @@
 Code that calls `gsplat.rasterization` runs without CUDA by importing it from here.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal, get_args
 
 import torch

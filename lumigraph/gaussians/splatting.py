@@ -1,7 +1,5 @@
 """Splatting: rendering a cloud of Gaussians for a camera (Kerbl 2023)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -19,12 +19,12 @@ from ..camera import Camera
 from ..camera.rays import Rendering
 from ..color.blending import before, over
 from ..components.clouds.cloud import Cloud, RateNumbers
-from ..components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
+from ..components.tracking.alignment import COLOUR_DEVIATION, aligned
 from ..components.tracking.frames import DepthFrame, Moment
 from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
 from ..components.tracking.trajectory import Pose, apply_twists
 from ..datasets.scene import Frame, Scene
-from ..errors import LumigraphError, LumigraphWarning
+from ..errors import LumigraphWarning
 from ..files.ranges import CloudSize, Count, between, changed
 from ..gaussians import Gaussians
 from ..gaussians.cloud import joined
@@ -40,6 +40,7 @@ DEPTH_ERROR_FACTOR = 50.0  # lambda, medians of the depth error beyond which a s
 NEW_SILHOUETTE = 0.5  # below which a pixel's surface is new (section 3.3)
 OVERLAP_PIXELS = 1600  # of a frame, by which its overlap with keyframes is measured
 OVERLAP_BORDER = 20 / 640  # of a keyframe's width, within which points do not count
+MIN_COVERED = 0.1  # share of a frame's measured pixels that the map must cover to explain it
 DEPTH_TOLERANCE = 0.1  # relative error of depth up to which a pixel is explained
 TRUNCATION = 0.1  # metres from the rendered surface within which points are aligned with it
 NORMAL_STEP = 2  # pixels between the points that a rendered normal is made of
@@ -131,13 +132,6 @@ class SplatSlam(Method):
         super().compile_begin()
         self.rehearses = True
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        super().begin(data, seconds)
-        if "depth" not in data.layers:
-            raise LumigraphError(
-                f"{data.source} has no depth, from which Gaussians are made; train gaussian-splatting, which needs none"
-            )
-
     def batch(self, data: Scene, generator: torch.Generator) -> Moment:
         """The frame that is next, and the scene."""
         return self.tracker.moment(data)
@@ -159,7 +153,7 @@ class SplatSlam(Method):
         if frame is not None and (len(tracker.keyframes) * c.keyframe_every <= self.mapped(batch, frame)):
             tracker.add_keyframe(frame)
             before = tracker.trajectory.poses.clone()
-            if tracker.close_loop(frame, batch.scene, chance):
+            if tracker.close_loop(frame, batch.scene):
                 self.carry(before)
         self.figures |= {"gaussians": len(self.cloud), "keyframes": len(tracker.keyframes)}
         return terms
@@ -193,11 +187,12 @@ class SplatSlam(Method):
 
     @torch.no_grad()
     def explained(self, frame: DepthFrame, pose: Pose) -> float:
-        """Share of measured pixels with depth explained by the map."""
+        """Share of the measured pixels that the map covers with depth explained by it; of a tenth of all at least."""
         depth, known = axial(frame)
         seen = self.seen(self.gaussians(), frame, pose)
-        right = (seen.opacity > NEW_SILHOUETTE) & ((surface_depth(seen) - depth).abs() < DEPTH_TOLERANCE * depth)
-        return float((right & known).sum() / known.sum().clamp_min(1))
+        there = known & (seen.opacity > NEW_SILHOUETTE)
+        right = there & ((surface_depth(seen) - depth).abs() < DEPTH_TOLERANCE * depth)
+        return float(right.sum() / there.sum().clamp_min(MIN_COVERED * known.sum()).clamp_min(1))
 
     # Tracking (section 3.2)
 
@@ -247,8 +242,7 @@ class SplatSlam(Method):
             return torch.where(inside, distance / (TRUNCATION * self.unit), 2.0), values[:, 6:9]
 
         pixels = frame.sample_pixels(ALIGNMENT_POINTS, chance, measured=True)
-        points = frame.rays[pixels].at(frame.depth[pixels])
-        deviation = sensor_deviation(frame.depth[pixels] / self.unit) / TRUNCATION
+        points, deviation = frame.points(pixels), frame.deviation[pixels] / (TRUNCATION * self.unit)
         rgb, steps = frame.rgb[pixels], ALIGNMENT_ITERATIONS
         return aligned(field, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, steps).pose
 
@@ -280,7 +274,7 @@ class SplatSlam(Method):
             chosen = chosen[:: math.ceil(len(chosen) / room)] if room > 0 else chosen[:0]
         if not len(chosen):
             return
-        points = frame.rays[chosen].at(frame.depth[chosen]) @ pose[:, :3].T + pose[:, 3]
+        points = frame.points(chosen) @ pose[:, :3].T + pose[:, 3]
         deviation = depth.flatten()[chosen] / view_of(frame.camera).focal.mean()
         added = balls(points, deviation, self.target(frame).flatten(0, 1)[chosen])
         self.add(added, frame.index)
@@ -318,7 +312,7 @@ class SplatSlam(Method):
     def overlaps(self, frame: DepthFrame, others: Sequence[DepthFrame], chance: torch.Generator) -> list[float]:
         """Share of a frame's measured points that each of other frames sees."""
         pixels, pose = frame.sample_pixels(OVERLAP_PIXELS, chance, measured=True), self.pose(frame)
-        points = frame.rays[pixels].at(frame.depth[pixels]) @ pose[:, :3].T + pose[:, 3]
+        points = frame.points(pixels) @ pose[:, :3].T + pose[:, 3]
         shares = []
         for other in others:
             camera = replace(other.camera, pose=self.pose(other)[None])

@@ -5,8 +5,6 @@ are meshes: "path/to/folder" is a collection of all its meshes, "path/to/mesh.ob
 Pictures are rendered once and cached, since training passes over a collection many times.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace

@@ -23,6 +23,7 @@ SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the m
 COLOUR_DEVIATION = 0.08  # of luminance
 MOTION_DEVIATION = 0.01, 0.02  # of a frame's motion from the first estimate: radians, metres
 INDEPENDENT_SHARE = 0.003  # of the points, whose errors count as independent beside that
+LEVEL_SHARE = 2e-3  # of the measured pixels, that have the same depth if it has levels
 SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
 
 
@@ -89,6 +90,17 @@ def aligned(
 def sensor_deviation(metres: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
     """Standard deviation of measured depth, metres."""
     return SENSOR_DEVIATION[0] + SENSOR_DEVIATION[1] * metres.square()
+
+
+def level_step(metres: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
+    """Distance of each depth from the next level, where depth has few levels, as of eight bits; else 0."""
+    known = metres[metres.isfinite()]
+    levels, counts = (1e4 * known).round().unique(return_counts=True)
+    levels = levels[counts >= LEVEL_SHARE * len(known)] / 1e4
+    if len(levels) < 3 or int(counts[counts >= LEVEL_SHARE * len(known)].sum()) < 0.5 * len(known):
+        return torch.zeros_like(metres)
+    gaps, place = levels.diff(), torch.searchsorted(levels, metres.nan_to_num(0.0))
+    return torch.minimum(gaps[(place - 1).clamp(0, len(gaps) - 1)], gaps[place.clamp(0, len(gaps) - 1)])
 
 
 def normal_equations(residual: Tensor, slope: Tensor, arm: Tensor, band: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,8 @@
 """Loop closure: recognition of revisited places, and pose graph optimisation.
 
-Similar keyframes are candidates. Their matched features with depth give a rigid motion by RANSAC, which verifies the
-loop. Poses then minimise the error of motions between neighbours and across loops (Grisetti et al. 2010, eq. 7), with a
-robust loss by SciPy: COLMAP's pose graph stores pairs of views and optimises none.
+Similar keyframes are candidates. Points of one at matched features of the other give a rigid motion by RANSAC, and
+measured depths that agree verify the loop. Poses then minimise the error of motions between neighbours and across loops
+(Grisetti et al. 2010, eq. 7), with a robust loss by SciPy: COLMAP's pose graph optimises none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 from ...datasets.scene import Photograph
 from ...method import Part
 from ..training.bundle_adjustment import rotation_vector
-from ..training.shared_points import Seen, features, matched
+from ..training.shared_points import Seen, features, matched, resected
 from .frames import DepthFrame
 from .trajectory import Pose, apply_twists, relative
 
@@ -31,9 +31,7 @@ HOLE = 2  # pixels to measured depth, up to which a feature has that depth
 MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
-HYPOTHESES = 200  # motions from three matches each
-TOLERANCE = 0.05  # metres between matched points of one place
-MIN_INLIERS, MIN_INLIER_SHARE = 25, 0.5  # matches that a loop's motion explains, and their share
+MIN_INLIERS = 25  # matches that a loop's motion explains
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -59,6 +57,11 @@ class KeyframePlace:
         along = torch.where(inside, depth[places[:, 0], places[:, 1]], torch.nan)
         small = adaptive_avg_pool2d(picture.mean(-1)[None, None], THUMBNAIL).flatten()
         return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
+
+    def matched_points(self, other: KeyframePlace) -> tuple[Float[Tensor, "match 3"], Float[Tensor, "match 3"]]:
+        """Points of this keyframe, and the directions in which another one sees them."""
+        pairs = matched(self.seen, other.seen)
+        return self.points[pairs[:, 0]], other.seen.bearings[pairs[:, 1]]
 
 
 class FramePlaces:
@@ -99,11 +102,11 @@ class Loops(Part):
         self.register_buffer("motions", torch.zeros(0, 3, 4))
         self.places = FramePlaces()
 
-    def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
+    def find(self, frame: DepthFrame, older: list[DepthFrame]) -> bool:
         """Search the place of a new keyframe among older ones; True if found."""
         for other in self.places.alike(frame, older[:-MIN_AGE]):
-            motion = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
-            if motion is not None:
+            motion = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
+            if motion is not None and frame.compared(other, motion).agrees:
                 pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
                 self.pairs = torch.cat([self.pairs, pair])
                 self.motions = torch.cat([self.motions, motion[None].to(self.motions)])
@@ -125,34 +128,6 @@ def motion(first: Pose, second: Pose) -> Pose:
     """Pose of the second in the frame of the first."""
     turn, shift = relative(first, second)
     return torch.cat([turn, shift[:, None]], -1)
-
-
-def motion_between(
-    first: KeyframePlace, second: KeyframePlace, tolerance: float, chance: torch.Generator
-) -> Pose | None:
-    """Pose of the second camera in the frame of the first, by RANSAC over matched points; None for too few inliers."""
-    pairs = matched(first.seen, second.seen)
-    a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
-    known = (a.isfinite() & b.isfinite()).all(-1)
-    a, b = a[known].double(), b[known].double()
-    if len(a) < MIN_INLIERS:
-        return None
-    chosen = torch.rand(HYPOTHESES, len(a), generator=chance).topk(3).indices
-    tried = fitted(a[chosen], b[chosen])
-    agree = (b @ tried[:, :, :3].mT + tried[:, None, :, 3] - a).norm(dim=-1) < tolerance
-    best = agree[agree.sum(-1).argmax()]
-    if int(best.sum()) < max(MIN_INLIERS, MIN_INLIER_SHARE * len(a)):
-        return None
-    return fitted(a[best], b[best]).float()
-
-
-def fitted(a: Float[Tensor, "*set point 3"], b: Float[Tensor, "*set point 3"]) -> Float[Tensor, "*set 3 4"]:
-    """Rotation and shift from points b to points a by least squares (Umeyama 1991, without a scale)."""
-    (a, first), (b, second) = ((x - (middle := x.mean(-2, keepdim=True)), middle) for x in (a, b))
-    u, _, vt = torch.linalg.svd(a.mT @ b)
-    u = torch.cat([u[..., :2], u[..., 2:] * torch.linalg.det(u @ vt).sign()[..., None, None]], -1)
-    turn = u @ vt
-    return torch.cat([turn, (first - second @ turn.mT).mT], -1)
 
 
 def optimised(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import Annotated, Any, ClassVar, Literal
@@ -16,20 +16,19 @@ from ...datasets.scene import Scene
 from ...errors import LumigraphError, LumigraphWarning
 from ...files.ranges import Share, between
 from ...method import Part
-from .alignment import sensor_deviation
-from .frames import DepthFrame, Moment, order_of
-from .loops import TOLERANCE, FramePlaces, Loops, motion_between
-from .trajectory import KNOWN, Pose, Trajectory, angle, moved, relative
+from ..training.shared_points import resected
+from .frames import MIN_AGREEMENT, MIN_COMMON, DepthFrame, Moment, order_of
+from .loops import FramePlaces, Loops, motion
+from .trajectory import CONTRADICTED, KNOWN, LOST, UNEXPLAINED, UNMEASURED, Pose, Trajectory, angle, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
-MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
+MAX_STEP = 0.4, 0.6  # metres and radians between frames that tracking believes
+MIN_MATCHES = 10  # features whose points agree on a frame's pose
 FAST = 0.02, 0.026  # metres and radians a frame, above which tracking begins with features
 MAX_MOTION = 0.05, 0.053  # metres and radians a frame, above which a warning is given
 RECENT_FRAMES, JUDGED_FRAMES = 4, 10  # whose motion decides about features, and about the warning
-AGREEMENT_POINTS, AGREEMENT_KEYFRAMES = 2000, 3  # pixels of a frame, and keyframes that they are compared with
-AGREEMENT_DEVIATIONS = 3.0  # of the sensor, within which depths agree
-MIN_AGREEMENT, MIN_ON_KEYFRAME = 0.65, 0.35  # share of common points that must agree; of a keyframe's, which hides some
-MIN_COMMON = 0.2  # share of a frame's points in common with another, below which they are not compared
+AGREEMENT_KEYFRAMES = 3  # latest keyframes that a frame's depth is compared with
+MIN_ON_KEYFRAME = 0.35  # share of points in common with a keyframe that must be on its depth, which hides some
 ALIGNMENT_POINTS = 3000  # pixels of a frame that are aligned with the map's surface
 ALIGNMENT_ITERATIONS = 12  # Gauss-Newton steps of that
 
@@ -72,9 +71,10 @@ class Tracker(Part):
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        if self.numbers.track and "depth" not in data.layers:
+        if "depth" not in data.layers:
             raise LumigraphError(
-                f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
+                f"{data.source} has no depth, which maps of depth cameras are made of; train instant-ngp or "
+                "gaussian-splatting, which need none"
             )
 
     def sequence(self, data: Scene) -> list[int]:
@@ -108,11 +108,11 @@ class Tracker(Part):
         self._held[frame.index] = frame
 
     @torch.no_grad()
-    def close_loop(self, frame: DepthFrame, data: Scene, chance: torch.Generator) -> bool:
+    def close_loop(self, frame: DepthFrame, data: Scene) -> bool:
         """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
         keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
         older = [self.load_keyframe(data, i) for i in keyframes if i != frame.index]
-        if self.loops is None or not self.loops.find(frame, older, chance):
+        if self.loops is None or not self.loops.find(frame, older):
             return False
         self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
         return True
@@ -149,8 +149,12 @@ class Tracker(Part):
         limit = len(moment.before) - moment.before.index(known[-1])  # frames since the last known pose
         by_velocity = (pose for start in smooth if self.plausible(last, pose := find(frame, start), limit))
         by_features = (
-            pose for start in self.by_features(frame, data, known[-1]) for pose in (find(frame, start), start)
+            pose
+            for start in self.by_features(frame, data, known[-1])
+            if self.plausible(last, start, limit)
+            for pose in (find(frame, start), start)
         )
+        reason = LOST if frame.measured.any() else UNMEASURED
         for pose in chain(by_features, by_velocity) if fast else chain(by_velocity, by_features):
             share = explained(frame, pose)
             if share > self.numbers.lost_share and self.agrees(frame, pose, data, known[-1]):
@@ -159,51 +163,44 @@ class Tracker(Part):
                 self.places.keep([*self.keyframes, frame.index])
                 self.warn_of_speed([*known, frame.index])
                 return share
-        trajectory.lose(frame.index, last)
+            if reason != UNMEASURED:
+                reason = CONTRADICTED if share > self.numbers.lost_share else UNEXPLAINED
+        trajectory.lose(frame.index, last, reason)
         return None
 
     def by_features(self, frame: DepthFrame, data: Scene, last: int) -> Iterator[Pose]:
-        """Poses by features matched with the latest keyframe, the last known frame, and keyframes that look alike."""
-        chance, older = torch.Generator().manual_seed(frame.index), self.keyframes
+        """Poses by features matched with the latest keyframe and the last known frame, then with keyframes that look
+        alike."""
+        older = self.keyframes
 
-        def others() -> Iterator[DepthFrame]:
-            yield from (self.frame(data, i) for i in dict.fromkeys([*older[-1:], last]))
-            yield from self.places.alike(frame, [self.load_keyframe(data, i) for i in older[:-1] if i != last])
+        def matches(others: Iterable[DepthFrame]) -> Iterator[tuple[Tensor, Tensor]]:
+            for other in others:
+                points, bearings = self.places.of(other).matched_points(self.places.of(frame))
+                pose = self.trajectory.poses[other.index].cpu()
+                yield points @ pose[:, :3].T + pose[:, 3], bearings
 
-        for other in others():
-            found = motion_between(self.places.of(other), self.places.of(frame), TOLERANCE * self.unit, chance)
-            if found is not None:
-                found = found.to(self.trajectory.poses)
-                yield moved(self.trajectory.poses[other.index], found[:, :3], found[:, 3])
+        def groups() -> Iterator[Iterable[DepthFrame]]:
+            yield (self.frame(data, i) for i in dict.fromkeys([*older[-1:], last]))
+            yield from (
+                [x] for x in self.places.alike(frame, [self.load_keyframe(data, i) for i in older[:-1] if i != last])
+            )
+
+        for group in groups():
+            points, bearings = (torch.cat(x) for x in zip(*matches(group), strict=True))
+            if (found := resected(points, bearings, MIN_MATCHES)) is not None:
+                yield found.to(self.trajectory.poses)
 
     @torch.no_grad()
     def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:
         """True if measured points of a frame lie on the depth of the last known frame, and are not in front of that of
         the keyframe with most points in common: no error of the map can spoil these. Also where they share too little.
         Stores the largest share of points that lie on a late keyframe's depth."""
-        pixels = frame.sample_pixels(AGREEMENT_POINTS, torch.Generator().manual_seed(frame.index), measured=True)
-        points = frame.rays[pixels].at(frame.depth[pixels]) @ pose[:, :3].T + pose[:, 3]
-
-        def compared(other: DepthFrame) -> tuple[float, float, float]:
-            """Shares of the points that are in the picture, on its depth, and in front of that."""
-            there = self.trajectory.poses[other.index]
-            local = (points - there[:, 3]) @ there[:, :3]
-            places, inside = other.camera.locate(local)
-            away = local.norm(dim=-1)
-            ahead = other.depth.view(other.size[::-1])[places[:, 0], places[:, 1]] - away
-            seen, off = inside & ahead.isfinite(), AGREEMENT_DEVIATIONS * self.unit * sensor_deviation(away / self.unit)
-            shares = (x.float().mean() for x in (seen, seen & (ahead.abs() < off), seen & (ahead >= off)))
-            common, near, front = (float(x) for x in shares)
-            return common, near, front
-
-        if not len(pixels):
-            return True
-        common, near, _ = compared(self.frame(data, last))
-        keyframes = [compared(self.load_keyframe(data, i)) for i in self.keyframes[-AGREEMENT_KEYFRAMES:]]
-        self.overlap = max((x[1] for x in keyframes), default=1.0)
-        most, on, front = max(keyframes, default=(0.0, 0.0, 0.0))
-        steady = common < MIN_COMMON or near > MIN_AGREEMENT * common
-        return steady and (most < MIN_COMMON or (on > MIN_ON_KEYFRAME * most and on > MIN_AGREEMENT * (on + front)))
+        latest = [self.frame(data, last), *(self.load_keyframe(data, i) for i in self.keyframes[-AGREEMENT_KEYFRAMES:])]
+        steady, *keyframes = (frame.compared(x, motion(self.trajectory.poses[x.index], pose)) for x in latest)
+        self.overlap = max((x.near for x in keyframes), default=1.0)
+        most = max(keyframes, key=lambda x: x.common, default=steady)
+        on_it = most.near > MIN_ON_KEYFRAME * most.common and most.near > MIN_AGREEMENT * (most.near + most.front)
+        return (steady.common < MIN_COMMON or steady.agrees) and (most.common < MIN_COMMON or on_it)
 
     def warn_of_speed(self, known: list[int]) -> None:
         """Warn once, of motion beyond the range of tracking in ten frames."""

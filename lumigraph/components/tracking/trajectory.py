@@ -16,7 +16,13 @@ from ...datasets.scene import Scene
 from ...geometry import rotated
 from ...method import Part
 
-UNKNOWN, LOST, KNOWN = 0, 1, 2  # states of a frame
+UNKNOWN, LOST, KNOWN, UNMEASURED, UNEXPLAINED, CONTRADICTED = range(6)  # states of a frame
+LOSSES = {
+    LOST: "too few of its features match known frames",
+    UNMEASURED: "its depth was not measured",
+    UNEXPLAINED: "the map does not explain its depth",
+    CONTRADICTED: "its depth contradicts that of known frames",
+}
 
 Pose = Float[Tensor, "3 4"]
 Twist = Float[Tensor, "pose 6"]  # rotation vector in the world's axes about the camera, then shift in scene units
@@ -25,7 +31,7 @@ Twist = Float[Tensor, "pose 6"]  # rotation vector in the world's axes about the
 class Trajectory(Part):
     """Poses of all frames, camera-to-world, scene units, by their image number.
 
-    state:  UNKNOWN before tracking, LOST where tracking failed, KNOWN
+    state:  UNKNOWN before tracking, KNOWN, or one of LOSSES where tracking failed
     anchor: keyframe beside which a frame was tracked: the frame moves with corrections of the keyframe's pose
     tracks: whether poses are estimated; otherwise they are those of the cameras
     """
@@ -49,9 +55,9 @@ class Trajectory(Part):
         self.poses[index] = rigid(pose[None])[0]
         self.state[index], self.anchor[index] = KNOWN, anchor
 
-    def lose(self, index: int, pose: Pose) -> None:
-        """Keep the last known pose for a frame where tracking failed."""
-        self.poses[index], self.state[index] = pose, LOST
+    def lose(self, index: int, pose: Pose, reason: int = LOST) -> None:
+        """Keep the last known pose for a frame where tracking failed. reason: of LOSSES"""
+        self.poses[index], self.state[index] = pose, reason
 
     def predicted(self, before: list[int]) -> Pose:
         """Pose of the next frame at constant velocity. before: the two frames before, the later one first"""

@@ -32,6 +32,7 @@ MAX_ANGLE = 0.7  # angle between descriptors that may be the same, radians
 NEIGHBOURS = 16  # photographs that each one is compared with: those that look most alike by their poses
 SIDEWAYS = math.radians(75)  # between two views, beyond which they are not compared
 ERROR = 4.0  # of FOCAL, off the epipolar line that the two views' own best motion may leave
+RESECTION_ERROR = 6.0  # of FOCAL, between a feature and its point seen from the pose that most of them agree on
 FOCAL = 1000.0  # in which pixels of all lenses are compared
 FLAT = 0.1  # cosine off the axis, beyond which a picture has no flat plane
 MIN_MATCHES = 8  # matches of two views, fewer of which are chance
@@ -114,15 +115,43 @@ def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "
     """Inlier matches of the essential matrix (RANSAC, Nister 2004); none if too few to exclude chance."""
     ends = a.bearings[pairs[:, 0]], b.bearings[pairs[:, 1]]
     ahead = (ends[0][:, 2] > FLAT) & (ends[1][:, 2] > FLAT)
-    pairs, (first, second) = pairs[ahead], [(FOCAL * end[:, :2] / end[:, 2:])[ahead].double().numpy() for end in ends]
+    pairs, (first, second), flat = pairs[ahead], [flattened(end[ahead]) for end in ends], flat_camera()
     options = pycolmap.RANSACOptions(max_error=ERROR, random_seed=0)
-    flat = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, 1, 1)
-    flat.params = [FOCAL, 0.0, 0.0]
     found = (
         pycolmap.estimate_essential_matrix(first, second, flat, flat, options) if len(pairs) >= MIN_MATCHES else None
     )
     kept = pairs[torch.from_numpy(np.array(found["inlier_mask"]))] if found else pairs[:0]
     return kept if len(kept) >= MIN_MATCHES else pairs[:0]
+
+
+def flattened(bearings: Float[Tensor, "ray 3"]) -> np.ndarray:
+    """Pixels of directions in the flat camera."""
+    return (FOCAL * bearings[:, :2] / bearings[:, 2:]).double().numpy()
+
+
+def flat_camera() -> Any:
+    flat = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, 1, 1)
+    flat.params = [FOCAL, 0.0, 0.0]
+    return flat
+
+
+def resected(
+    points: Float[Tensor, "match 3"], bearings: Float[Tensor, "match 3"], minimum: int
+) -> Float[Tensor, "3 4"] | None:
+    """Pose of a camera that sees points in these directions of its own frame (perspective-n-point by LO-RANSAC, then
+    least squares); None for fewer inliers than `minimum`. Points with an unknown place have NaN."""
+    known = points.isfinite().all(-1) & (bearings[:, 2] > FLAT)
+    if int(known.sum()) < minimum:
+        return None
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed = RESECTION_ERROR, 0
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        flattened(bearings[known]), points[known].double().numpy(), flat_camera(), options
+    )
+    if found is None or found["num_inliers"] < minimum:
+        return None
+    motion = torch.from_numpy(np.array(found["cam_from_world"].inverse().matrix()))
+    return motion.to(points)
 
 
 def neighbours(cameras: Camera) -> list[tuple[int, int]]:

@@ -88,24 +88,9 @@ def _cost(
 
 @njit(parallel=True, cache=True, **FAST)
 def _costs(
-    reference,
-    trust,
-    values,
-    weights,
-    masked,
-    rows,
-    columns,
-    warps,
-    pixels,
-    views,
-    planes,
-    dx,
-    dy,
-    apart,
-    sharpness,
-    samples,
-    out,
-):
+    reference, trust, values, weights, masked, rows, columns, warps, pixels, views, planes, dx, dy, apart, sharpness,
+    samples, out,
+):  # fmt: skip
     width = reference.shape[1]
     for chunk in prange((len(pixels) + CHUNK - 1) // CHUNK):
         a, w, across, down = np.empty((4, len(samples)), np.float32)
@@ -119,26 +104,9 @@ def _costs(
                 for i in range(views.shape[1]):
                     n = views[p, i]
                     out[p, m, i] = _cost(
-                        warps,
-                        n,
-                        planes,
-                        p,
-                        m,
-                        x,
-                        y,
-                        across,
-                        down,
-                        a,
-                        w,
-                        whole,
-                        shift,
-                        values,
-                        weights,
-                        rows,
-                        columns,
-                        masked,
-                        samples,
-                    )
+                        warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows,
+                        columns, masked, samples,
+                    )  # fmt: skip
 
 
 def run(reference, trust, neighbours, neighbour_trust, warps, pixels, views, planes, window, deviation):

@@ -101,5 +101,5 @@ class GaussianSplatting(CloudMethod):
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
         return changed(Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
-            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, refine_cameras=True,
+            strategy="error", refine_until=0.8, opacity_reset_interval=5, refine_cameras=True,
             appearance="no")  # fmt: skip

@@ -16,7 +16,7 @@ from ...camera.rays import Rays
 from ...color.blending import before
 from ...components.fields.hash_field import TINY_TABLE, HashNumbers
 from ...components.fields.spaces import Box
-from ...components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
+from ...components.tracking.alignment import COLOUR_DEVIATION, aligned
 from ...components.tracking.frames import DepthFrame, Moment
 from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
 from ...components.tracking.trajectory import Pose, apply_twists
@@ -181,7 +181,7 @@ class IMap(FieldMethod):
             ):
                 self.tracker.add_keyframe(frame)
                 self.snapshot.load_state_dict(self.network.state_dict())
-                afresh |= self.tracker.close_loop(frame, batch.scene, chance)  # the map follows the corrected poses
+                afresh |= self.tracker.close_loop(frame, batch.scene)  # the map follows the corrected poses
             frame = frame if learns else None
         return self.map(
             frame,
@@ -235,8 +235,7 @@ class IMap(FieldMethod):
         field = self.network
         assert isinstance(field, DistanceTable)
         pixels = frame.sample_pixels(ALIGNMENT_POINTS, chance, measured=True)
-        points = frame.rays[pixels].at(frame.depth[pixels])
-        deviation = sensor_deviation(frame.depth[pixels] / self.unit) * self.unit / field.truncation
+        points, deviation = frame.points(pixels), frame.deviation[pixels] / field.truncation
 
         def seen(world: Tensor) -> tuple[Tensor, Tensor]:
             _, features = field.geometry(world)

@@ -3,8 +3,6 @@
 Held-out views are spread over the same second. `angle` is the ball's exact position at any time.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
