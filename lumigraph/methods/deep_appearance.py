@@ -43,6 +43,7 @@ FIRST_SIDE = 4  # texels a side, from which the decoder begins
 NEAR = 1e-3  # scene units, before which triangles are cut off
 TEXTURE_WEIGHT = 1.0  # lambda_T of the loss
 MESH_WEIGHT = 1.0  # lambda_M of the loss
+VIEW_FEATURES = 8  # of the view's direction (section 4.2)
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,6 @@ class Config(BaseConfig):
     code: Count = 128  # numbers of an expression's code
     channels: Width = 16  # of the decoder's finest layer but one; coarser layers have up to 16 times as many
     max_channels: Width = 128  # of any layer
-    view_features: Count = 8  # of the view's direction (section 4.2)
     mesh_width: Width = 256  # of the layer before the mesh
     divergence_weight: NonNegative = 0.01  # lambda_Z
     mesh_rows: Annotated[int, between(5, 512)] = 73  # of the mesh's grid; 7306 vertices are the paper's
@@ -120,8 +120,8 @@ class Networks(nn.Module):
         self.mesh_out = nn.Sequential(
             nn.Linear(c.code, c.mesh_width), nn.LeakyReLU(SLOPE), nn.Linear(c.mesh_width, numbers)
         )
-        self.view = nn.Linear(3, c.view_features)
-        self.first = nn.Linear(c.code + c.view_features, flat)
+        self.view = nn.Linear(3, VIEW_FEATURES)
+        self.first = nn.Linear(c.code + VIEW_FEATURES, flat)
         up = [*widths, 3]
         self.up = nn.ModuleList(
             Up(a, b, FIRST_SIDE << (k + 1)) for k, (a, b) in enumerate(zip(up[:-1], up[1:], strict=True))

@@ -28,6 +28,8 @@ from .fields import LOGIT_SCALE, OccupancyField, TableField
 
 MarchSteps = Annotated[int, between(4, 4096)]
 
+NORMAL_WEIGHT = 0.05  # weight of L_normal, which smooths the surface
+
 
 @dataclass(frozen=True)
 class Config(BaseConfig):
@@ -42,7 +44,6 @@ class Config(BaseConfig):
     hull_cells: Cells = 0  # cells per axis of the visual hull, outside of which rays do not look; 0: they look anywhere
     rays_per_step: BatchSize = 2048  # rays of a step; more reduce noise, and cost time
     depth_weight: NonNegative = 0.0  # weight of L_depth, for photographs with depth; 0: depth is not read
-    normal_weight: NonNegative = 0.05  # weight of L_normal; higher smooths the surface
     neighbour_distance: Positive = 2e-3  # side of the cube around a point from which L_normal draws its neighbour
     difference_step: Positive = 2e-3  # scene units between two values whose difference is a normal's component
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
@@ -151,11 +152,10 @@ class DVR(SurfaceMethod):
         if c.depth_weight:
             error = (t[met] - batch.extra["depth"][met])[right].abs()
             terms["depth"] = c.depth_weight * error[error.isfinite()].sum() / count
-        if c.normal_weight:
-            here = points.detach()
-            shift = torch.rand(here.shape, generator=generator).to(here) - 0.5
-            normals = (normalize(self._differences(x), dim=-1) for x in (here, here + c.neighbour_distance * shift))
-            terms["normal"] = c.normal_weight * sum_of_lengths(*normals) / count
+        here = points.detach()
+        shift = torch.rand(here.shape, generator=generator).to(here) - 0.5
+        normals = (normalize(self._differences(x), dim=-1) for x in (here, here + c.neighbour_distance * shift))
+        terms["normal"] = NORMAL_WEIGHT * sum_of_lengths(*normals) / count
         terms |= self._mask_terms(rays, t.detach(), inside, samples, generator)
         shown = self.background.repeat(count, 1).index_copy(0, met, rgb.detach())
         self.figures = {"mse": float((shown - batch.before(self.background)).square().mean()), "met": len(met) / count}

@@ -42,6 +42,7 @@ DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in
 
 HYPER_LAYERS = 2  # hidden layers of the hypernetwork for each tensor
 DENOISER_WIDTH = 32  # channels of the denoiser, section 3.3
+CODE_WEIGHT = 0.0  # of the codes' squares: an option of older runs, always off
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,6 @@ class Config(BaseConfig):
     targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that a step's rays come from
     empty_points: Tally = 1024  # random points of a member in empty space, for empty_weight; 0: no such term
     empty_weight: NonNegative = 0.01  # weight of density in known empty space; higher removes floating density
-    code_weight: NonNegative = 0.0  # weight of the codes' squares in the loss; higher keeps codes near zero
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
@@ -223,8 +223,7 @@ class HypNeRF(RayMethod):
     def loss(self, batch: InstanceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of colours of all members (eq. 2), density in empty space, and the denoiser's error."""
         generator, share = self.random(step), 1 / len(batch.members)
-        codes = self.codes(torch.tensor(batch.members, device=self.device))
-        instances = self._made(codes)
+        instances = self._made(self.codes(torch.tensor(batch.members, device=self.device)))
         terms: dict[str, Tensor] = {}
         mse = 0.0
         for instance, evidence in zip(instances, batch.evidence, strict=True):
@@ -232,8 +231,6 @@ class HypNeRF(RayMethod):
                 terms[name] = terms.get(name, 0.0) + share * term
             mse += share * self.figures["mse"]
         self.figures["mse"] = mse
-        if self.config.code_weight:
-            terms["code"] = self.config.code_weight * codes.square().mean()
         if self._denoising:
             terms["denoiser"] = self._denoiser_error(batch, instances[-1])
         return terms

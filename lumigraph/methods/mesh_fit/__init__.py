@@ -32,6 +32,8 @@ from ...system.work import at_work
 from .optimizer import UniformAdam
 from .surface import MeshSurface, face_normals, remeshed, vertex_normals
 
+MASK_WEIGHT = 1.0  # weight of the silhouettes' absolute error
+
 
 @dataclass(frozen=True)
 class Config(BaseConfig):
@@ -47,7 +49,6 @@ class Config(BaseConfig):
     remeshings: Annotated[int, between(0, 20)] = 2  # from the first to the last; 0 keeps the first triangles
     remeshing_until: Share = 0.6  # share of the budget in which they happen
     views_per_step: Annotated[int, between(1, 64)] = 8  # photographs of a step; more are steadier, and cost time
-    mask_weight: NonNegative = 1.0  # of the silhouettes' absolute error
     laplacian_weight: NonNegative = 0.0  # of |L x|^2 over squared edges; larger is smoother
     normal_weight: NonNegative = 0.0  # of 1 - cosine between neighbours' normals; larger is flatter
 
@@ -165,7 +166,7 @@ class MeshFit(Method):
                 silhouette.append((off if photograph.mask is None else off[photograph.mask]).mean())
         terms = {"colour": torch.stack(colour).mean()}
         if silhouette:
-            terms["mask"] = c.mask_weight * torch.stack(silhouette).mean()
+            terms["mask"] = MASK_WEIGHT * torch.stack(silhouette).mean()
         if c.laplacian_weight:
             terms["laplacian"] = c.laplacian_weight * surface.roughness(vertices)
         if c.normal_weight:
