@@ -173,12 +173,13 @@ def test_a_component_of_one_method_is_noticed():
 
 
 def heirs(sources: Sources) -> list[str]:
-    """Configs with a base class."""
+    """Configs with a base class other than BaseConfig, which has the numbers of them all."""
     return [
-        f"{module}.{node.name}({', '.join(map(ast.unparse, node.bases))})"
+        f"{module}.{node.name}({bases})"
         for module, source in sources.items()
         for node in nodes(source)
-        if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Numbers")) and node.bases
+        if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Numbers"))
+        if (bases := ", ".join(map(ast.unparse, node.bases))) not in ("", "BaseConfig")
     ]
 
 
@@ -188,6 +189,7 @@ def test_no_config_inherits(house):
 
 def test_a_config_that_inherits_is_noticed():
     assert heirs({"a": "class Config:\n    pass\nclass NGP(RayMethod):\n    Config = Config"}) == []
+    assert heirs({"a": "class Config(BaseConfig):\n    pass"}) == []
     assert heirs({"a": "class Config(HashNumbers, b.C):\n    pass"}) == ["a.Config(HashNumbers, b.C)"]
 
 
