@@ -98,7 +98,9 @@ def moved_capture(source: Path, target: Path) -> Path:
 
 def lumigraph(*words: object) -> None:
     """A command, in this process. Raises SystemExit if it fails."""
-    if main_of([*map(str, words)]):
+    with torch.enable_grad():
+        failed = main_of([*map(str, words)])
+    if failed:
         raise SystemExit(f"lumigraph {' '.join(map(str, words))} failed")
 
 

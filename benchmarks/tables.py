@@ -7,8 +7,8 @@
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
-choose rows; `table: strangers` is of `strangers.py --publish`; `<!-- end of table -->` ends it. Below it are the
-commit, the machine, and the commands of those rows.
+choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`;
+`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from lumigraph.metrics import scores_of
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
 GALLERY, STRANGERS = RESULTS.with_name("gallery-cpu.json"), RESULTS.with_name("strangers-cpu.json")
+MINUTE = RESULTS.with_name("one-minute-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 GUIDES = {  # pages about sections of the gallery, in docs/
@@ -68,7 +69,7 @@ class Options:
 def read() -> dict[str, Any]:
     """Results of `lumigraph bench methods`, and of other programs as parts of them."""
     results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
-    others = {"gallery": GALLERY, "strangers": STRANGERS}
+    others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE}
     return results | {name: json.loads(path.read_text("utf-8")) for name, path in others.items()}
 
 
@@ -206,6 +207,19 @@ def by_verdict(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
+def by_seconds(cells: Sequence[Row], page: Path) -> list[str]:
+    """Means over seeds of each capture, method and budget, with the deviation of the PSNR."""
+    rows = [["capture", "method", "s", "PSNR", "SSIM", "LPIPS", "steps", "Gaussians", "needles", "memory"]]
+    for row in cells:
+        deviation = f" ± {row['deviation']:.2f}" if row["deviation"] is not None else ""
+        lpips = f"{row['lpips']:.3f}" if row["lpips"] is not None else ""
+        cloud = [f"{row['gaussians']:,.0f}", f"{row['needles']:.1%}"] if "gaussians" in row else ["", ""]
+        told = [f"{row['scene']}, {row['resolution']}", link(row["method"], page), f"{row['seconds']:g}"]
+        told += [f"{row['psnr']:.2f}{deviation}", f"{row['ssim']:.3f}", lpips, f"{row['steps']:.0f}", *cloud]
+        rows.append([*told, size(int(row["peak_memory"]))])
+    return markdown(rows)
+
+
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
     score = next(iter(scores_of(row)))
@@ -225,8 +239,14 @@ KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "sections": by_section,
     "gallery": by_showpiece,
     "strangers": by_verdict,
+    "minute": by_seconds,
 }
-OTHERS = {"sections": "gallery", "gallery": "gallery", "strangers": "strangers"}  # where the figures of a table are
+OTHERS = {
+    "sections": "gallery",
+    "gallery": "gallery",
+    "strangers": "strangers",
+    "minute": "minute",
+}  # where the figures of a table are
 
 
 def scenes_of(cells: Sequence[Row]) -> str:

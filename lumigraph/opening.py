@@ -4,9 +4,6 @@ Photographs become a Scene, meshes are Shapes, folders of either a Collection; a
 scenes have kinds of their own.
 """
 
-from __future__ import annotations
-
-import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +17,7 @@ from .datasets.shapes import Shapes
 from .datasets.words import WORDS, Words
 from .datasets.world import BlockLabels, BlockWorld
 from .errors import LumigraphError
+from .exchange import refuse_several
 from .files import exists, expanded
 from .files.names import natural
 from .files.ranges import typed
@@ -97,6 +95,8 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
         return Collection
     if path.is_dir() and any(reader.recognises(path) for reader in READERS.values()):
         return Scene
+    if not list_images(path):
+        refuse_several(path)
     if meshes.recognises(path) or (wanted is Shapes and any(map(meshes.is_mesh, path.rglob("*")))):
         return Shapes
     return Collection if len(members_of(path)) > 1 else Scene
@@ -104,8 +104,10 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
 
 def folder_of(path: Path) -> Path:
     """Folder of a capture for one of the files by which a reader recognises it; any other path unchanged."""
-    names = (re.split(r"[\s,;()]+", reader.EXPECTED_FILES) for reader in READERS.values() if path.suffix)
-    return path.parent if path.is_file() and any(path.name in words for words in names) else path
+    if not path.is_file():
+        return path
+    listed = (name for reader in READERS.values() for names in reader.EXPECTED_FILES.values() for name in names)
+    return next((path.absolute().parents[name.count("/")] for name in listed if path.match(name)), path)
 
 
 def sources_of(collection: str | Path) -> dict[str, str]:

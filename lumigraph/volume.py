@@ -1,7 +1,5 @@
 """Volume rendering: weights of samples along rays, colour, depth and opacity."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

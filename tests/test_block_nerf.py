@@ -95,16 +95,16 @@ def test_transmittance_is_that_of_what_lies_before():
 def test_visibility_agrees_with_the_transmittance_of_a_wall():
     """Rays along +x meet a wall at x = 0 from the left: before it all is seen, behind it nothing, and in haze before a
     second wall as much as the haze lets through."""
-    torch.manual_seed(0)
+    torch.manual_seed(2)
     space = space_of(Frame(near=0.01))
     network = Visibility(space, 4, 2, 32)
-    adam, random = torch.optim.Adam(network.parameters(), 1e-2), torch.Generator().manual_seed(0)
-    wall = Samples(torch.full((512,), 1.0), torch.full((512,), 1.3), torch.arange(513))
-    density = torch.where(torch.arange(512) < 256, 100.0, math.log(2) / 0.3)  # above z = 0 a wall, haze below it
-    for _ in range(250):
-        y, z = torch.rand(2, 512, generator=random)
-        origins = torch.stack([-torch.ones(512), 2 * y - 1, torch.where(density > 50, z, -z)], -1)
-        rays = Rays(origins, torch.tensor([[1.0, 0, 0]]).expand(512, 3), torch.zeros(512))
+    adam, random = torch.optim.Adam(network.parameters(), 2e-2), torch.Generator().manual_seed(2)
+    wall = Samples(torch.full((128,), 1.0), torch.full((128,), 1.3), torch.arange(129))
+    density = torch.where(torch.arange(128) < 64, 100.0, math.log(2) / 0.3)  # above z = 0 a wall, haze below it
+    for _ in range(120):
+        y, z = torch.rand(2, 128, generator=random)
+        origins = torch.stack([-torch.ones(128), 2 * y - 1, torch.where(density > 50, z, -z)], -1)
+        rays = Rays(origins, torch.tensor([[1.0, 0, 0]]).expand(128, 3), torch.zeros(128))
         error = network.error(rays, wall, density, random)
         adam.zero_grad()
         error.backward()

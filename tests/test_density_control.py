@@ -10,14 +10,16 @@ import torch
 from budgets import budget
 from test_gaussians import NAMES, cloud
 
-from lumigraph import methods
+from lumigraph import kernels, methods
 from lumigraph.components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from lumigraph.components.clouds.cloud import Cloud, CloudAdam
 from lumigraph.components.clouds.density_control import MIN_CAP, PRUNE_OPACITY, RefineNumbers
+from lumigraph.components.clouds.error_density import ErrorDensity
 from lumigraph.components.clouds.initialization import initial_cloud, nearest_distance
 from lumigraph.components.training.row_optimizers import adam_rate
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ranges import changed
+from lumigraph.geometry import to_matrix
 from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
 from lumigraph.methods.gaussian_splatting.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
 from lumigraph.run import build
@@ -231,10 +233,11 @@ def test_a_cap_may_follow_the_budget(numbers, steps, cap, monkeypatch):
     assert control.current_cap(Cloud(cloud(10)), 0.5, steps) == cap
 
 
-def test_a_chain_needs_a_cap():
+@pytest.mark.parametrize("strategy", ["mcmc", "error"])
+def test_what_grows_to_its_cap_needs_one(strategy):
     kind = methods.find("gaussian-splatting")
     with pytest.raises(LumigraphError, match="--max-gaussians"):
-        build(kind, tiny.scene().frame, kind.Config(strategy="mcmc"), torch.device("cpu"), 0)
+        build(kind, tiny.scene().frame, kind.Config(strategy=strategy), torch.device("cpu"), 0)
 
 
 def test_opacity_is_reset_for_all_but_the_faint():
@@ -332,3 +335,75 @@ def test_nearest_distances():
     expected = torch.tensor([(1 + 4) / 2, (1 + 5) / 2, (4 + 5) / 2]).sqrt()
     torch.testing.assert_close(nearest_distance(points), expected)
     assert nearest_distance(points[:1]).tolist() == [1.0]
+
+
+def by_error(count: int) -> ErrorDensity:
+    return ErrorDensity(RefineNumbers(), AdaptiveNumbers(), count)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_gaussian_explains_its_share_of_the_error_and_nothing_else_changes(measured):
+    """The followed gradient is sum_p w_i(p) error(p), with weights of the derivative of grey harmonics; other gradients
+    are those without it, where depth is measured as well."""
+    scene, kind = tiny.scene(), methods.find("gaussian-splatting")
+    depth = {"depth_weight": 0.5} if measured else {}
+    found = {}
+    for strategy in ("error", "adaptive"):
+        config = changed(kind.smallest(), strategy=strategy, refine_cameras=False, **depth)
+        method = build(kind, scene.frame, config, torch.device("cpu"), 0)
+        method.begin(scene)
+        method.progress = 0.3
+        method.before_step(3, method.progress)
+        batch = method.batch(scene, torch.Generator().manual_seed(1))
+        sum(method.loss(batch, 3).values()).backward()
+        found[strategy] = method, {name: getattr(method.cloud, name).grad for name in NAMES}
+    for name in NAMES:
+        torch.testing.assert_close(found["error"][1][name], found["adaptive"][1][name], rtol=1e-5, atol=1e-8)
+    method, step = found["error"][0], found["error"][0].current
+    assert found["adaptive"][0].current.explained is None and ("measured" in step.terms) == measured
+    error = (step.rgb - step.target).detach().abs().mean(-1)
+    weights, seen = torch.zeros(len(method.cloud), 3, requires_grad=True), step.picture
+    footprints = seen.centres.detach(), seen.conics.detach(), seen.opacities.detach()
+    grey, _, _ = kernels.rasterize(*footprints, weights, seen.depths.detach(), seen.tiles, seen.stop)
+    (grey[..., 0] * error).sum().backward()
+    torch.testing.assert_close(step.explained.grad, weights.grad[:, 0] / error.numel(), rtol=1e-4, atol=1e-9)
+    assert (step.explained.grad > 0).sum() > 20
+
+
+def test_the_largest_errors_are_divided_up_to_the_cap_and_faint_ones_go(generator):
+    some = Cloud(cloud(6))
+    with torch.no_grad():
+        some.opacities[:] = torch.tensor([0.5] * 5 + [PRUNE_OPACITY / 2]).logit()
+    learn(some, rate=0.0)
+    control = by_error(6)
+    control.explained += torch.tensor([0.1, 3.0, 0.2, 2.0, 0.0, 9.0])
+    assert control.refine(some, 1.0, 7, generator)
+    assert torch.equal(some.source, torch.tensor([0, 1, 2, 3, 4, 1, 3])) and not control.explained.any()
+    learn(some, rate=0.0)
+    control.explained = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert not control.refine(some, 1.0, 100, generator)  # what explains no error stays whole
+    assert len(some) == 8
+
+
+def test_two_halves_keep_place_variance_and_faint_opacity(generator):
+    """Both have the centre and, along each axis, the variance of the one that was divided; the pair lets as much light
+    through a thin one as before, along the line of the centres."""
+    some = Cloud(cloud(30))
+    with torch.no_grad():
+        some.opacities[:] = torch.tensor(0.02).logit()
+    before = some.gaussians()[:]
+    learn(some, rate=0.0)
+    control = by_error(30)
+    control.explained += 1
+    control.refine(some, 1.0, 60, generator)
+    one, two = some.gaussians()[:30], some.gaussians()[30:]
+    torch.testing.assert_close((one.means + two.means) / 2, before.means, rtol=0, atol=1e-5)
+    offset = (to_matrix(before.quaternions).mT @ (one.means - before.means)[:, :, None])[:, :, 0]
+    torch.testing.assert_close(
+        offset.square() + (2 * one.log_scales).exp(), (2 * before.log_scales).exp(), rtol=1e-3, atol=0
+    )
+    longest = before.log_scales.argmax(-1, keepdim=True)
+    shrunk = (one.log_scales - before.log_scales).gather(1, longest)
+    torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5 * torch.tensor(0.5).log().item()))
+    assert (one.log_scales <= before.log_scales + 1e-6).all()
+    torch.testing.assert_close(2 * one.opacities.sigmoid() * 0.5**0.5, torch.full((30,), 0.02), rtol=0.02, atol=0)

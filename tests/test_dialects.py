@@ -2,36 +2,45 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import shutil
-import struct
+import sys
 import unicodedata
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from budgets import budget
-from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_nerfstudio, write_ngp
+from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_nerfies, write_nerfstudio, write_ngp
 from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
 from lumigraph.camera.lens import Pinhole
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import holds_points, is_moving, is_splat_file, read_gaussians, read_moving, write_gaussians
 from lumigraph.exchange.fourdgs import write_moving
+from lumigraph.exchange.unpacked_gltf import packed, part, unpacked
+from lumigraph.export.mesh_file import write_mesh
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
+from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.large import open_any
-from lumigraph.opening import read_capture
-from lumigraph.readers import choose_reader, colmap, light_field, phones, pictures, transforms
+from lumigraph.opening import folder_of, kind_of, read_capture
+from lumigraph.readers import choose_reader, colmap, light_field, nerfies, phones, pictures, transforms
 from lumigraph.readers.capture import checked_pose
 from lumigraph.readers.finding import find_named, paired
 from lumigraph.readers.meshes import read_mesh
-from lumigraph.readers.numbers import kind_of, read_numbers
-from lumigraph.readers.pictures import find_file, read_image
+from lumigraph.readers.numbers import kind_of as kind_of_numbers
+from lumigraph.readers.numbers import read_numbers
+from lumigraph.readers.pictures import find_file, read_image, read_mask
 from lumigraph.sfm.photos.gather import gather, is_bare, left_out_films, lone_film, walk
 from lumigraph.system.cache import cache_folder, temporary_cache
 
@@ -52,12 +61,34 @@ def frames_named(tiny: Tiny, form: str) -> list[dict]:
 @pytest.mark.parametrize(
     "form",
     [r"images\{}", r"C:\Users\me\scan\images\{}", "/home/me/scan/images/{}", "scan/images/{}", "./images/{}", "{}",
-     r"\\server\share\scan\images\{}", "IMAGES/{}", "images/images/{}"],
+     r"\\server\share\scan\images\{}", "IMAGES/{}", "images/images/{}", "file:///home/me/image%73/{}"],
 )  # fmt: skip
 def test_paths_of_other_machines_lead_to_the_photographs(tiny, tmp_path, form):
     folder = write_ngp(tmp_path, tiny, frames=frames_named(tiny, form))
     found = transforms.read(folder)
     assert len(found.shots) == 6 and not found.missing
+
+
+def test_a_link_that_was_copied_as_text_leads_to_its_folder(tiny, tmp_path):
+    folder = write_ngp(tmp_path / "scene", tiny, frames=frames_named(tiny, "/home/me/scan/images/{}"))
+    (folder / "images").rename(tmp_path / "photographs")
+    (folder / "images").write_text("../photographs")
+    assert len(transforms.read(folder).shots) == 6
+
+
+def test_names_in_another_encoding(tiny, tmp_path):
+    folder = write_colmap(tmp_path, tiny, text=True)
+    for path in [*(folder / "images").iterdir()]:
+        path.rename(path.with_name(path.name.replace("view", "v\u00fce")))
+    path = folder / "sparse/0/images.txt"
+    path.write_bytes(path.read_text().replace("view", "v\u00fce").encode("latin-1"))
+    assert len(colmap.read(folder).shots) == 6
+
+
+def test_photographs_beside_the_folder_of_poses(tiny, tmp_path):
+    folder = write_ngp(tmp_path / "nerfstudio", tiny, frames=frames_named(tiny, "{}"))
+    (folder / "images").rename(tmp_path / "resized_images")
+    assert len(transforms.read(folder).shots) == 6
 
 
 def test_names_in_other_letters(tmp_path):
@@ -171,8 +202,97 @@ def test_lost_poses_cost_their_photographs_and_a_scaled_camera_none(tiny, tmp_pa
     np.testing.assert_allclose(checked_pose(shots[1], "here"), tiny.poses[3][:3], atol=1e-6)
 
 
-def test_a_scene_is_named_by_its_file_too(tiny, tmp_path):
-    assert len(read_capture(write_ngp(tmp_path, tiny) / "transforms.json").shots) == 6
+def test_published_splits_of_dycheck(tiny, tmp_path):
+    folder = write_nerfies(tmp_path, tiny)
+    ids = json.loads((folder / "dataset.json").read_text())["ids"]
+    (folder / "splits").mkdir()
+    for split, names in (("train", ids[::2]), ("val", ids[3:4])):
+        (folder / "splits" / f"{split}.json").write_text(json.dumps({"frame_names": names, "camera_ids": [0]}))
+    found = {shot.name: shot.split for shot in nerfies.read(folder).shots}
+    assert found == {name: "test" if name == ids[3] else "train" if name in ids[::2] else "val" for name in ids}
+
+
+def test_models_without_lines_of_features(tiny, tmp_path):
+    folder = write_colmap(tmp_path, tiny, text=True)
+    path = folder / "sparse/0/images.txt"
+    path.write_text("".join(f"{x}\n" for x in path.read_text().splitlines() if x.endswith(".png") or x[0] == "#"))
+    found = colmap.read(folder)
+    assert len(found.shots) == 6 and found.points is not None and len(found.points) == 200
+
+
+def test_fields_that_are_null_count_as_absent(tiny, tmp_path):
+    folder = write_ngp(tmp_path, tiny, camera_model=None, k1=None, ply_file_path=None)
+    assert len(transforms.read(folder).shots) == 6
+
+
+def test_masks_that_are_not_there_are_named_and_cost_nothing(tiny, tmp_path):
+    folder = write_ngp(tmp_path, tiny, mask_path="masks/none.png")
+    found = transforms.read(folder)
+    assert len(found.shots) == 6 and found.missing == ["masks/none.png"] * 6
+    assert all(shot.mask is None for shot in found.shots)
+
+
+BLACK = np.zeros((HEIGHT, WIDTH), np.uint8)
+HALF = np.repeat(np.arange(2, dtype=np.uint8), WIDTH // 2)[None].repeat(HEIGHT, 0)
+
+
+@pytest.mark.parametrize(
+    ("picture", "share"),
+    [
+        (HALF, 0.5),
+        (np.dstack([BLACK, BLACK, BLACK, 255 * HALF]), 0.5),
+        (255 * HALF, 0.5),
+        (257 * 255 * HALF.astype(np.uint16), 0.5),
+    ],
+)
+def test_masks_of_ones_and_masks_in_alpha(tiny, tmp_path, picture, share):
+    folder = write_ngp(tmp_path, tiny)
+    (folder / "Masks").mkdir()
+    for name in tiny.names:
+        Image.fromarray(picture).save(folder / "Masks" / name)
+    masks = [shot.mask for shot in read_capture(folder).shots]
+    assert {read_mask(mask, (WIDTH, HEIGHT), True).mean() for mask in masks} == {share}
+
+
+def test_thumbnails_of_a_nas_and_of_macos_are_no_photographs(tmp_path):
+    unseen = "@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg", "__MACOSX/._a.jpg", "__MACOSX/b.jpg", ".thumbs/c.jpg"
+    for place in (*unseen, "a.jpg", "a.mask.png"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (4, 4)).save(tmp_path / place)
+    assert pictures.list_images(tmp_path) == ["a.jpg", "a.mask.png"]
+    assert [path.name for path in walk(tmp_path)] == ["a.jpg"]
+
+
+def test_transposed_poses_are_refused(tiny, tmp_path):
+    frames = frames_named(tiny, "images/{}")
+    for frame in frames:
+        frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    with pytest.raises(LumigraphError, match="last row is 4, 0, 1, 1, not 0, 0, 0, 1; transpose it"):
+        transforms.read(write_ngp(tmp_path, tiny, frames=frames))
+
+
+def test_a_capture_further_down_and_under_another_name_is_named(tiny, tmp_path):
+    write_ngp(tmp_path / "unpacked" / "scene", tiny)
+    with pytest.raises(LumigraphError, match=r"no camera poses itself, and .*unpacked/scene does"):
+        read_capture(tmp_path)
+    (tmp_path / "cameras.xml").write_text("<document>")
+    with pytest.raises(LumigraphError, match="the poses of Metashape"):
+        read_capture(tmp_path / "cameras.xml")
+    place = tmp_path / "unpacked" / "scene" / "transforms.json"
+    place.rename(place.with_name("cameras_nerf.json"))
+    for path in (place.parent, place.with_name("cameras_nerf.json")):
+        with pytest.raises(LumigraphError, match="under another name, .* name the file transforms.json"):
+            read_capture(path)
+
+
+@pytest.mark.parametrize("file", ["transforms.json", "sparse/0/images.bin", "sparse/0/cameras.txt"])
+def test_a_scene_is_named_by_its_file_too(tiny, tmp_path, file, monkeypatch):
+    folder = write_ngp(tmp_path, tiny) if file == "transforms.json" else write_colmap(tmp_path, tiny)
+    (folder / file).touch()
+    assert folder_of(folder / file) == folder
+    monkeypatch.chdir((folder / file).parent)
+    assert folder_of(Path(Path(file).name if "/" not in file else folder / file)) == folder
+    assert file == "sparse/0/cameras.txt" or len(read_capture(folder / file).shots) == 6
 
 
 @pytest.mark.parametrize(("kind", "suffix"), [("JPEG", ".tif"), ("AVIF", ".avif"), ("JPEG", ".jfif"), ("WEBP", ".jpg")])
@@ -198,7 +318,7 @@ def test_a_large_jpeg_is_decoded_reduced(tmp_path, monkeypatch):
 def test_depth_of_floats_keeps_its_numbers(tmp_path):
     values = np.linspace(0.5, 7, 12, dtype="<f4").reshape(3, 4)
     (tmp_path / "a.pfm").write_bytes(b"Pf\n4 3\n-1.0\n" + values[::-1].tobytes())
-    assert kind_of(tmp_path / "a.pfm").dtype == np.float32
+    assert kind_of_numbers(tmp_path / "a.pfm").dtype == np.float32
     np.testing.assert_array_equal(read_numbers(tmp_path / "a.pfm"), values)
 
 
@@ -489,6 +609,67 @@ def test_a_folder_of_a_cloud_a_frame_moves(tmp_path):
     assert not is_moving(tmp_path / "clip"), "a folder of clouds that are no frames"
 
 
+def test_several_clouds_are_no_shapes(tmp_path):
+    for name in ("chair.ply", "lamp.ply"):
+        write_gaussians(tmp_path / name, cloud())
+    for read in (kind_of, open_any):
+        with pytest.raises(LumigraphError, match="holds 2 files of Gaussians, such as chair.ply; name one"):
+            read(tmp_path)
+    (tmp_path / "a.obj").write_text("v 0 0 0")
+    assert kind_of(tmp_path) is Shapes
+
+
+def test_colours_as_bytes_and_one_scale(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    known = [x for x in rows.dtype.names if not x.startswith(("f_", "scale_1", "scale_2"))]
+    other = np.zeros(len(rows), [(x, "<f4") for x in known] + [(x, "u1") for x in ("red", "green", "blue")])
+    for name in known:
+        other[name] = rows[name]
+    other["green"] = 255
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": other}, [])
+    found = read_gaussians(tmp_path / "b.ply")
+    torch.testing.assert_close(found.harmonics[:, 0] * K00 + 0.5, torch.tensor([0.0, 1, 0]).expand(len(rows), 3))
+    torch.testing.assert_close(found.log_scales, cloud().log_scales[:, :1].expand(-1, 3))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [(["f_anchor_feat_0"], "anchors of Scaffold-GS"), (["t", "scale_t"], "4D-GS")]
+)
+def test_clouds_that_need_more_than_their_file_are_named(tmp_path, names, words):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    more = np.zeros(len(rows), rows.dtype.descr + [(name, "<f4") for name in names])
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": more}, [])
+    with pytest.raises(LumigraphError, match=words):
+        read_gaussians(tmp_path / "b.ply")
+
+
+def test_a_zipped_folder_of_sog_opens(tmp_path):
+    write_gaussians(tmp_path / "a.sog", cloud())
+    with zipfile.ZipFile(tmp_path / "a.sog") as old, zipfile.ZipFile(tmp_path / "b.sog", "w") as new:
+        new.writestr("scene/", "")
+        new.writestr("__MACOSX/scene/._meta.json", "")
+        for name in old.namelist():
+            new.writestr(f"scene/{name}", old.read(name))
+    torch.testing.assert_close(read_gaussians(tmp_path / "b.sog").means, read_gaussians(tmp_path / "a.sog").means)
+
+
+def test_harmonics_of_degree_four_are_cut(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    known = [name for name in rows.dtype.names if not name.startswith("f_rest_")]
+    more = np.zeros(len(rows), [(x, "<f4") for x in (*known, *(f"f_rest_{i}" for i in range(72)))])
+    for name in known:
+        more[name] = rows[name]
+    for i in range(72):
+        more[f"f_rest_{i}"] = i
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": more}, [])
+    with pytest.warns(LumigraphWarning, match="harmonics of degree 4 are passed over"):
+        found = read_gaussians(tmp_path / "b.ply")
+    assert found.harmonics[0, 1:, 2].tolist() == list(range(48, 63))
+
+
 def test_frames_of_other_gaussians_follow_each_other(tmp_path):
     for i in range(2):
         write_gaussians(tmp_path / "clip" / f"{i}.ply", cloud(20 + i))
@@ -557,18 +738,138 @@ def test_a_cloud_of_points_is_described(tmp_path):
         choose_reader(tmp_path / "a.xyz")
 
 
-@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
-def test_packed_meshes_are_refused_by_the_name_of_their_packing(tmp_path, name):
-    about = {
-        "asset": {"version": "2.0"},
-        "extensionsRequired": [name],
-        "meshes": [{"primitives": [{"attributes": {}}]}],
-    }
-    text = json.dumps(about).encode()
-    text += b" " * (-len(text) % 4)
-    (tmp_path / "a.gltf").write_bytes(text)
-    data = b"JSON".join([struct.pack("<4sIII", b"glTF", 2, 20 + len(text), len(text)), text])
-    (tmp_path / "a.glb").write_bytes(data)
-    for file in ("a.glb", "a.gltf"):
-        with pytest.raises(LumigraphError, match=f"packed by {name}, which is not read"):
-            read_mesh(tmp_path / file)
+@pytest.mark.parametrize("line", ["-s 1 1 1 tex\\a b.png", r"C:\Users\me\A B.png", "none.png"])
+def test_textures_are_found_as_photographs_are(tmp_path, line):
+    (tmp_path / "tex").mkdir()
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(tmp_path / ("tex" if "tex" in line else ".") / "a b.png")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 1 1 1\nmap_Kd {line}\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib m.mtl\n{corners}usemtl a\nf 1/1 2/2 3/3\n")
+    if line == "none.png":
+        with pytest.warns(LumigraphWarning, match="names none.png, which is not beside it"):
+            read_mesh(tmp_path / "a.obj")
+    else:
+        assert (read_mesh(tmp_path / "a.obj").colours == [255, 0, 0]).all()
+
+
+def test_strips_of_triangles(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {x}\n" for x in "xyz")
+    head += "".join(f"property uchar {x}\n" for x in "rgb") + "element tristrips 1\n"
+    rows = "0 0 0 9 0 0\n1 0 0 9 0 0\n0 1 0 9 0 0\n1 1 0 9 0 0\n9 0 1 2 3 -1 1 3 2 -1\n"
+    (tmp_path / "a.ply").write_text(f"{head}property list int int vertex_indices\nend_header\n{rows}")
+    found = read_mesh(tmp_path / "a.ply")
+    assert len(found.faces) == 3 and (found.colours == [9, 0, 0]).all()
+
+
+# Red above, blue below, 8 x 8 pixels of ETC1S
+KTX2 = (
+    "q0tUWCAyMLsNChoKAAAAAAEAAAAIAAAACAAAAAAAAAAAAAAAAQAAAAEAAAABAAAAaAAAACwAAACUAAAAJAAAALgAAAAAAAAAggAA"
+    "AAAAAAA6AQAAAAAAAAEAAAAAAAAAAAAAAAAAAAAsAAAAAAAAAAIAKACjAQIAAwMAAAgAAAAAAAAAAAA/AAAAAAAAAAAA/////x8A"
+    "AABLVFh3cml0ZXIAQmFzaXMgVW5pdmVyc2FsIDIuMTAAAAIAAQAqAAAABQAAACsAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAg"
+    "wEQAAAAAAADiRAQwEQAAAAAAgCQgAEwACAAAAAAgBgATAAAAAAAACCasqqqqAjTARAAAAAAAABJFAJgAEAAAAABAFAImAgAAAAAA"
+    "kDYCwASAAAAAAAAiEAAA"
+)
+SOLID = trimesh.creation.icosphere(1)
+BALL = Mesh(np.array(SOLID.vertices), np.array(SOLID.faces), (127 * SOLID.vertices + 127).astype(np.uint8))
+VECTOR = {"type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]}
+
+
+def packed_ball(path: Path, how: str) -> dict:
+    """JSON of a coloured mesh that is written, packed by an extension."""
+    write_mesh(path, BALL, np.array([0.0, 1, 0]))
+    about, whole = unpacked(path)
+    position, colours, faces = (about["accessors"][i] for i in (0, 2, 3))
+    if how == "draco":
+        library = pytest.importorskip("DracoPy")
+        light = np.frombuffer(bytes(whole), "<f4", 3 * colours["count"], about["bufferViews"][2]["byteOffset"]).reshape(
+            -1, 3
+        )
+        data = library.encode(BALL.vertices, BALL.faces, 20, preserve_order=True, generic_attributes={7: light})
+        primitive, numbers = about["meshes"][0]["primitives"][0], {"POSITION": 0, "COLOR_0": 7}
+        numbers["POSITION"] = next(x["unique_id"] for x in library.decode(data).attributes if x["attribute_type"] == 0)
+        said = {"bufferView": part(about, whole, data), "attributes": numbers}
+        primitive["extensions"] = {"KHR_draco_mesh_compression": said}
+        for accessor in (position, colours, faces):
+            accessor.pop("bufferView")
+    else:
+        library = pytest.importorskip("meshopt")
+        for accessor, mode, width in ((position, "ATTRIBUTES", 3), (colours, "ATTRIBUTES", 3), (faces, "TRIANGLES", 1)):
+            view = about["bufferViews"][accessor["bufferView"]]
+            rows = np.frombuffer(bytes(whole), "<u4", width * accessor["count"], view["byteOffset"]).reshape(-1, width)
+            data = library.encode_gltf_buffer(rows if width > 1 else rows[:, 0], mode, 1 if how == "KHR" else 0)
+            inner = about["bufferViews"][part(about, whole, data)]
+            said = inner | {"count": len(rows), "mode": mode, "byteStride": 4 * width}
+            view |= {"buffer": 1, "byteOffset": 0, "extensions": {f"{how}_meshopt_compression": said}}
+        about["buffers"] = [{}, {"byteLength": 1, "extensions": {"EXT_meshopt_compression": {"fallback": True}}}]
+    about["buffers"][0] = {"byteLength": len(whole)}
+    path.write_bytes(packed(about, whole))
+    return about
+
+
+def test_a_gltf_without_scenes_is_the_scene_of_its_nodes(tmp_path):
+    write_mesh(tmp_path / "a.glb", BALL, np.array([0.0, 1, 0]))
+    about, whole = unpacked(tmp_path / "a.glb")
+    del about["scenes"], about["scene"]
+    (tmp_path / "a.glb").write_bytes(packed(about, whole))
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.glb").vertices, BALL.vertices, atol=1e-6)
+
+
+@pytest.mark.parametrize("how", ["draco", "EXT", "KHR"])
+def test_packed_meshes_are_unpacked(tmp_path, how):
+    packed_ball(tmp_path / "a.glb", how)
+    found = read_mesh(tmp_path / "a.glb")
+    np.testing.assert_allclose(found.vertices, BALL.vertices, atol=1e-5)
+    np.testing.assert_array_equal(found.colours, BALL.colours)
+    first, second = (np.sort(faces, 1) for faces in (found.faces, BALL.faces))
+    assert {*map(tuple, first)} == {*map(tuple, second)} and len(first) == len(second)
+
+
+@pytest.mark.parametrize(("how", "library"), [("draco", "DracoPy"), ("EXT", "meshopt")])
+def test_packed_meshes_name_the_package_that_unpacks_them(tmp_path, how, library, monkeypatch):
+    about = packed_ball(tmp_path / "a.glb", how)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(LumigraphError, match=f"which {library} reads; install it: pip install 'lumigraph"):
+        read_mesh(tmp_path / "a.glb")
+    monkeypatch.undo()
+    view = about["bufferViews"][-1]
+    (tmp_path / "a.glb").write_bytes(packed(about, bytearray(view["byteOffset"] + view["byteLength"])))
+    with pytest.raises(LumigraphError, match="is damaged where .* packs it"):
+        read_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    ("material", "colours"),
+    [
+        ({"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 0.5, 1]}}, [188, 188, 188]),
+        ({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, "picture"),
+        ({"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}}}, "picture"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["png", "webp", "ktx2"])
+def test_colours_of_gltf_are_those_of_its_material(tmp_path, material, colours, kind):
+    if kind == "ktx2" and colours == "picture":
+        pytest.importorskip("opengl_basisu")
+    write_gltf(
+        tmp_path / "a.gltf", {"componentType": 5126, "views": [(0, 48)], "bufferView": 0, "count": 4} | VECTOR, FLOATS
+    )
+    about = json.loads((tmp_path / "a.gltf").read_text())
+    uv = np.array([[10, 10], [10, 90], [90, 10], [90, 90]], "<u2")  # in hundredths, as quantisation has them
+    about["buffers"].append({"uri": "data:;base64," + base64.b64encode(uv.tobytes()).decode(), "byteLength": 16})
+    about["bufferViews"].append({"buffer": 1, "byteLength": 16})
+    about["accessors"].append({"bufferView": 1, "componentType": 5123, "count": 4, "type": "VEC2"})
+    about["meshes"][0]["primitives"][0] |= {"material": 0}
+    about["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 1
+    for said in (material.get("pbrMetallicRoughness", {}), *material.get("extensions", {}).values()):
+        for link in (x for x in said.values() if isinstance(x, dict)):
+            link["extensions"] = {"KHR_texture_transform": {"scale": [0.01, 0.01]}}
+    picture = np.repeat([[[255, 0, 0]], [[0, 0, 255]]], 4, 0).astype(np.uint8).repeat(8, 1)
+    if kind == "ktx2":
+        (tmp_path / "my picture.ktx2").write_bytes(base64.b64decode(KTX2))
+    else:
+        Image.fromarray(picture).save(tmp_path / f"my picture.{kind}", lossless=True)
+    named = {"ktx2": "KHR_texture_basisu", "webp": "EXT_texture_webp"}
+    source = {"extensions": {named[kind]: {"source": 0}}} if kind in named else {"source": 0}
+    about |= {"materials": [material], "textures": [source], "images": [{"uri": f"my%20picture.{kind}"}]}
+    (tmp_path / "a.gltf").write_text(json.dumps(about))
+    expected = [[255, 0, 0], [0, 0, 255], [255, 0, 0], [0, 0, 255]] if colours == "picture" else [colours] * 4
+    np.testing.assert_allclose(read_mesh(tmp_path / "a.gltf").colours.astype(int), expected, atol=8)

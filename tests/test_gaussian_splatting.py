@@ -42,7 +42,9 @@ def new(folder=None, **config):
     return method, None if folder is None else Run.create(folder, method, scene)
 
 
-@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc"}, {"filter_3d": True, "antialiased": True}])
+@pytest.mark.parametrize(
+    "config", [{}, {"strategy": "mcmc"}, {"strategy": "error", "filter_3d": True, "antialiased": True}]
+)
 def test_it_learns_a_scene(config):
     method, _ = new(opacity_reset_interval=1000, **config)
     fit(method, tiny.scene(), steps=1, show=False, rehearsal=False)
@@ -54,7 +56,9 @@ def test_it_learns_a_scene(config):
     assert 300 < len(method.cloud) <= 600
 
 
-@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc", "few_views": "yes"}, {"filter_3d": True}])
+@pytest.mark.parametrize(
+    "config", [{}, {"strategy": "mcmc", "few_views": "yes"}, {"strategy": "error", "filter_3d": True}]
+)
 def test_resuming_across_a_growing_cloud_is_exact(config, tmp_path):
     """Stopped after the cloud has grown, and before it grows again."""
     config = {"refine_until": 0.9, "max_gaussians": 2000, "densify_grad_threshold": 1e-3, **config}
@@ -70,7 +74,7 @@ def test_resuming_across_a_growing_cloud_is_exact(config, tmp_path):
         assert torch.equal(expected[name], actual[name]), name
 
 
-@pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
+@pytest.mark.parametrize("strategy", ["error", "mcmc"])
 def test_where_memory_is_short_it_stops_growing_and_says_so(strategy, monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: 0)
     method, _ = new(strategy=strategy)

@@ -114,6 +114,16 @@ def test_what_programs_made_is_passed_over(tmp_path):
     assert names(gather([photos], photos / "work")) == ["0.jpg", "1.jpg"]
 
 
+def test_links_to_folders_are_followed_once(tmp_path):
+    walk_past(tmp_path / "disk" / "left", 2)
+    walk_past(tmp_path / "disk" / "right", 2)
+    (tmp_path / "photos").mkdir()
+    for name in ("left", "right"):
+        (tmp_path / "photos" / name).symlink_to(tmp_path / "disk" / name)
+    (tmp_path / "disk" / "left" / "round").symlink_to(tmp_path / "photos")
+    assert len(names(gather([tmp_path / "photos"], tmp_path / "work"))) == 4
+
+
 def test_a_list_of_files_is_taken_each_once(tmp_path):
     a, b, _ = walk_past(tmp_path / "x", 3)
     c = store(tmp_path / "y" / "c.jpg", view(0, 400))

@@ -85,7 +85,8 @@ def test_pictures_are_those_of_the_definition(channels):
         assert torch.allclose(alpha[i, ..., 0].double(), opacity, atol=2e-4)
         solid = opacity > 0.05
         assert torch.allclose(picture[i, ..., -1].double()[solid], (values[..., -1] / opacity)[solid], rtol=2e-3)
-    assert meta["means2d"].shape == (2, 12, 2) and (meta["radii"] > 0).any()
+    rows = len(meta["gaussian_ids"])
+    assert meta["means2d"].shape == (rows, 2) and 12 < rows <= 24 and (meta["radii"] > 0).all()
 
 
 def test_gradients_are_those_of_the_definition():
@@ -128,6 +129,33 @@ def test_gradients_are_those_of_the_definition():
     assert meta["means2d"].grad.abs().sum() > 0
 
 
+def test_rows_of_the_dictionary_are_those_of_gsplat():
+    """Packed and not: the same picture, the same gradient of each pair's centre, radii that hold the footprint."""
+    given, (viewmats, intrinsics) = cloud(), cameras()
+    given["means"][3, 2] = -50.0  # behind both cameras
+    asked = {"viewmats": viewmats, "Ks": intrinsics, "width": SIZE[0], "height": SIZE[1]}
+    found = {}
+    for packed in (True, False):
+        ours = {name: value.clone().requires_grad_() for name, value in given.items()}
+        picture, _, meta = lumigraph.rasterization(**ours, **asked, packed=packed)
+        meta["means2d"].retain_grad()
+        picture.square().sum().backward()
+        found[packed] = picture, meta, {name: value.grad for name, value in ours.items()}
+    (one, rows, ours), (other, whole, theirs) = found[True], found[False]
+    assert torch.equal(one, other) and whole["gaussian_ids"] is None and whole["means2d"].shape == (2, 12, 2)
+    for name, gradient in ours.items():
+        torch.testing.assert_close(gradient, theirs[name])
+    pairs = rows["camera_ids"], rows["gaussian_ids"]
+    assert 3 not in pairs[1] and torch.equal(torch.stack(pairs, -1), (whole["radii"] > 0).all(-1).nonzero())
+    torch.testing.assert_close(rows["means2d"].grad, whole["means2d"].grad[pairs])
+    for name in ("means2d", "radii", "depths", "conics", "opacities"):
+        assert torch.equal(rows[name], whole[name][pairs]), name
+    xx, xy, yy = rows["conics"].unbind(-1)
+    width = (yy / (xx * yy - xy * xy)).sqrt()
+    reach = (2 * (255 * rows["opacities"]).log()).sqrt().clamp_max(3.33)
+    assert torch.equal(rows["radii"][:, 0], (reach * width).ceil().int()) and rows["radii"].dtype == torch.int32
+
+
 def test_harmonics_give_the_colours_of_each_camera():
     given, (viewmats, intrinsics) = cloud(), cameras()
     coefficients = torch.zeros(12, 4, 3)
@@ -148,7 +176,15 @@ def test_far_and_small_gaussians_are_left_out():
 
 
 @pytest.mark.parametrize(
-    "option", [{"absgrad": True}, {"camera_model": "fisheye"}, {"sh_degree": 4}, {"with_ut": True}]
+    "option",
+    [
+        {"render_mode": "RGD"},
+        {"rasterize_mode": "sharp"},
+        {"absgrad": True},
+        {"camera_model": "fisheye"},
+        {"sh_degree": 4},
+        {"with_ut": True},
+    ],
 )
 def test_what_there_is_not_is_refused_in_one_sentence(option):
     given, (viewmats, intrinsics) = cloud(), cameras(1)

@@ -1,7 +1,5 @@
 """Renderings of a run beside the photographs of the same views, which `lumigraph eval` makes."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any

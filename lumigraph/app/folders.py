@@ -1,7 +1,5 @@
 """Folder searches with limits of entries and seconds, so that no response of the app waits for a huge one."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ A record is authenticated with a key of this user. A job of another record, as i
 does not start by itself: it waits until a user presses a button.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

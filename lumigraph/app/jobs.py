@@ -4,8 +4,6 @@ A record is written before its process changes. After a kill of the app its chil
 app finds the job as running and starts the same command again, which continues from its stages or checkpoints.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Photographs of a project for the page: thumbnails, their state, and advice during upload."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Progress of a project as pictures: photographs with their features, cameras and sparse points, training."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sqlite3

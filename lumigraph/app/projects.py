@@ -12,8 +12,6 @@
 Runs and scenes that the command line made, also in `runs/` and `scenes/`, are items too.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

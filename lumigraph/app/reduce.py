@@ -4,8 +4,6 @@ Run as a script with a file and a number of pixels, it writes a JPEG to standard
 photograph is freed with the process. It imports nothing of the package, so it starts in a tenth of a second.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 

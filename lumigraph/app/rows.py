@@ -1,7 +1,5 @@
 """Rows of the page: JSON about items, runs, jobs and the findings of a capture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 A training has its own viewer (`--view`), proxied in the same way. Only the app is reachable from outside.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http.client

@@ -1,7 +1,5 @@
 """Files to share: kinds, the request to make each, and its estimated size."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 file gets its name when it is complete and of its declared type. Nothing is replaced: a file of the same name with other
 content gets a numbered name, and one with the same content is stored once."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno

@@ -31,6 +31,7 @@ CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is a
 PARAMETER_RANGES = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
 PARAMETER_RANGES |= {"offset": (-1e6, 1e6)}
 DEFAULT_RANGE = (-1e9, 1e9)  # for further parameters of a new kind of lens
+Distorted = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]  # (x', y') and its Jacobian, row by row
 NO_INDEX = torch.empty(0, dtype=torch.int64)
 
 
@@ -229,16 +230,7 @@ class OpenCV(Lens):
         target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
         target_x, target_y = target.T.contiguous()
         distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
-        x, y = within(target_x, target_y, limit)
-        for _ in range(NEWTON_STEPS):
-            (bent_x, bent_y), (xx, xy, yy) = bend(x, y, distortion)
-            off_x, off_y = bent_x - target_x, bent_y - target_y
-            share = 1 / (xx * yy - xy * xy).clamp_min(1e-3)  # the determinant is positive up to the fold
-            step_x, step_y = share * (yy * off_x - xy * off_y), share * (xx * off_y - xy * off_x)
-            x, y = within(x - step_x, y - step_y, limit)
-            if small(step_x) and small(step_y):
-                break
-        return through_plane(x, y)
+        return through_plane(*straightened(target_x, target_y, limit, lambda x, y: bend(x, y, distortion)))
 
     def project(self, points, index=None):
         plane, valid = onto_plane(points)
@@ -255,8 +247,8 @@ class OpenCV(Lens):
             loops.solid_angle(*(x.numpy() for x in tensors))
             return angle
         x, y, z = directions.T.contiguous()
-        _, (xx, xy, yy) = bend(x / z, y / z, columns(self.distortion, index))
-        return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
+        _, (xx, xy, yx, yy) = bend(x / z, y / z, columns(self.distortion, index))
+        return z * z * z / ((xx * yy - xy * yx).clamp_min(1e-3) * area(self.focal, index))
 
     def _by_loop(self, given: Tensor) -> bool:
         """True if the faster CPU loops apply: single precision, no gradients."""
@@ -338,15 +330,7 @@ class ThinPrism(Fisheye):
     def unproject(self, pixels, index=None):
         target_x, target_y = ((pixels - rows(self.centre, index)) / rows(self.focal, index)).unbind(-1)
         distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
-        x, y = within(target_x, target_y, limit)
-        for _ in range(NEWTON_STEPS):
-            (bent_x, bent_y), (xx, xy, yx, yy) = prism(x, y, distortion)
-            off_x, off_y = bent_x - target_x, bent_y - target_y
-            share = 1 / (xx * yy - xy * yx).clamp_min(1e-3)
-            step_x, step_y = share * (yy * off_x - xy * off_y), share * (xx * off_y - yx * off_x)
-            x, y = within(x - step_x, y - step_y, limit)
-            if small(step_x) and small(step_y):
-                break
+        x, y = straightened(target_x, target_y, limit, lambda x, y: prism(x, y, distortion))
         theta = torch.hypot(x, y)
         share = theta.sin() / theta.clamp_min(1e-12)
         return torch.stack([x * share, y * share, theta.cos()], -1)
@@ -622,10 +606,24 @@ def polynomial(s: Tensor, *coefficients: Tensor | float) -> Tensor:
     return torch.as_tensor(value)
 
 
-def bend(
-    x: Tensor, y: Tensor, distortion: Sequence[Tensor]
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
-    """OpenCV's distortion of (x, y, 1), and its Jacobian, which is symmetric: (dx'/dx, dx'/dy = dy'/dx, dy'/dy)."""
+def straightened(
+    target_x: Tensor, target_y: Tensor, limit: Tensor, distort: Callable[[Tensor, Tensor], Distorted]
+) -> tuple[Tensor, Tensor]:
+    """Points within a disc that a distortion moves to the targets, by Newton's method."""
+    x, y = within(target_x, target_y, limit)
+    for _ in range(NEWTON_STEPS):
+        (bent_x, bent_y), (xx, xy, yx, yy) = distort(x, y)
+        off_x, off_y = bent_x - target_x, bent_y - target_y
+        share = 1 / (xx * yy - xy * yx).clamp_min(1e-3)  # the determinant is positive up to the fold
+        step_x, step_y = share * (yy * off_x - xy * off_y), share * (xx * off_y - yx * off_x)
+        x, y = within(x - step_x, y - step_y, limit)
+        if small(step_x) and small(step_y):
+            break
+    return x, y
+
+
+def bend(x: Tensor, y: Tensor, distortion: Sequence[Tensor]) -> Distorted:
+    """OpenCV's distortion of (x, y, 1); its Jacobian is symmetric."""
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     s = x * x + y * y
     below = polynomial(s, 1, k4, k5, k6)
@@ -635,13 +633,12 @@ def bend(
     bent_x, bent_y = x * (q + 2 * across) + p2 * s, y * (q + 2 * across) + p1 * s
     xx = q + x * x * slope + 2 * across + 4 * p2 * x
     yy = q + y * y * slope + 2 * across + 4 * p1 * y
-    return (bent_x, bent_y), (xx, x * y * slope + 2 * down, yy)
+    xy = x * y * slope + 2 * down
+    return (bent_x, bent_y), (xx, xy, xy, yy)
 
 
-def prism(
-    x: Tensor, y: Tensor, distortion: Sequence[Tensor]
-) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Distortion of ThinPrism, and its Jacobian: (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
+def prism(x: Tensor, y: Tensor, distortion: Sequence[Tensor]) -> Distorted:
+    """Distortion of ThinPrism."""
     k1, k2, k3, k4, p1, p2, a, b = distortion
     s = x * x + y * y
     q, slope = polynomial(s, 1, k1, k2, k3, k4), 2 * polynomial(s, k1, 2 * k2, 3 * k3, 4 * k4)  # and 2 dq/ds

@@ -1,7 +1,5 @@
 """Alpha compositing over a background (Porter and Duff 1984), for straight and premultiplied colours."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

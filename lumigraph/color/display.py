@@ -4,8 +4,6 @@ Light of HLG and PQ is in cd/m2, with diffuse white at 203 (ITU-R BT.2408). What
 of ITU-R BT.2390, section 5.4.1, from the brightest light of a film or picture to white. Other light is 1 at white.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

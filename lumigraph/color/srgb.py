@@ -1,7 +1,5 @@
 """sRGB's encoding of light (IEC 61966-2-1)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

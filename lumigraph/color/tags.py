@@ -1,7 +1,5 @@
 """Pictures that are tagged as sRGB, so that programs with colour management show them as they are meant."""
 
-from __future__ import annotations
-
 import io
 import struct
 from pathlib import Path

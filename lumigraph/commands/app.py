@@ -1,7 +1,5 @@
 """`lumigraph app`: photographs in and scene out, in a browser."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import tempfile

@@ -5,8 +5,6 @@ holes=False, `--from depth` is from_="depth", `--set time=0.3` is set={"time": 0
 types and ranges of the fields. No text is parsed as a command line.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass, replace

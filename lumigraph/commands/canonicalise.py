@@ -1,7 +1,5 @@
 """`lumigraph canonicalise`: align runs of one category."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """`lumigraph capture`: find the camera poses of photographs or a video."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lumigraph clean`: remove floaters from a cloud of Gaussians, or crop it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

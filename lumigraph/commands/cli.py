@@ -7,8 +7,6 @@ values are checked against them.
 LUMIGRAPH_DEBUG=1 shows the traceback of a fault.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """Parts of several commands: devices, budgets, output."""
 
-from __future__ import annotations
-
 import contextlib
 import shlex
 import sys

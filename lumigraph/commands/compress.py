@@ -1,7 +1,5 @@
 """`lumigraph compress`: make a trained run smaller."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`lumigraph convert`: turn a trained run into one of another method."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass

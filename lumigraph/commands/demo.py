@@ -1,7 +1,5 @@
 """`lumigraph demo`: every step once, on a procedural scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

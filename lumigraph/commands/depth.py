@@ -1,7 +1,5 @@
 """`lumigraph depth`: depth maps of photographs by multi-view stereo, or of a pair by stereo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`lumigraph draw`: objects that a prior draws at random, as a sheet, a film, and their distance from photographs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

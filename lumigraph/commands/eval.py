@@ -1,7 +1,5 @@
 """`lumigraph eval`: score a run on held-out photographs or shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -51,6 +49,8 @@ class Eval(Reports, EvaluationOptions):
             rows[name] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         if trivial := result.get("baselines"):
             rows["without training"] = ", ".join(f"{name} {value:.2f}" for name, value in trivial.items())
+        if cloud := result.get("cloud"):
+            rows["cloud"] = f"{cloud['gaussians']:,} Gaussians, {cloud['needles']:.1%} of them needles"
         if "tracking" in result:
             rows["frames followed"] = result["tracking"]["share"]
         name = run.folder / stem(self.split)

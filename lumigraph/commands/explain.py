@@ -1,7 +1,5 @@
 """`lumigraph explain`: pictures of a paper's equations on your own data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal

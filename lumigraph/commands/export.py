@@ -1,7 +1,5 @@
 """`lumigraph export`: a trained scene in the formats of other programs."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every export with its options, as the viewer's tab Export offers them."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """`lumigraph gallery`: every method on its smallest data, on one page."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

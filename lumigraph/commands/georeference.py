@@ -1,7 +1,5 @@
 """`lumigraph georeference`: the frame of exports by control points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`lumigraph infer`: reconstruct a scene from a few photographs, or a shape from a scan, with a prior."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`lumigraph info`: contents of a run, a folder of photographs, a mesh, a splat file or a composition."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

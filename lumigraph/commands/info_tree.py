@@ -1,7 +1,5 @@
 """Contents of a run or a scene as a printed tree."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """`lumigraph jump`: a ring of cameras as omnidirectional stereo panoramas."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

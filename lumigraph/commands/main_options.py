@@ -1,7 +1,5 @@
 """Options of methods that `--help` shows; `--help-all` shows the others too."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass
 from typing import Any
 

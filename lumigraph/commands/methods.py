@@ -1,7 +1,5 @@
 """`lumigraph methods`: the list of methods."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from .. import methods

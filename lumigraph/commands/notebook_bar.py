@@ -1,7 +1,5 @@
 """Progress of training in a notebook: a bar and its figures, redrawn in place."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A run in a notebook: a small interactive page, rendered in seconds, above a still for front ends without frames."""
 
-from __future__ import annotations
-
 import base64
 import html
 import tempfile

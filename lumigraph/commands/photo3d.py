@@ -1,7 +1,5 @@
 """`lumigraph photo3d`: neighbouring photographs as one 3-D photograph, a page or a textured mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`lumigraph render`: render films of a trained scene. No photographs are needed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

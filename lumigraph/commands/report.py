@@ -1,7 +1,5 @@
 """`lumigraph report`: write a report of a run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ..files.options import Overwrite, RunOption

@@ -6,8 +6,6 @@ The options are the fields of the command's dataclass, with the same types and r
 value and never becomes another option, whatever it holds.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any, get_args
 

@@ -1,7 +1,5 @@
 """Results of commands as values: the file that was written, its figures, and the rows that the terminal shows."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

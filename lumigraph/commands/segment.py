@@ -1,7 +1,5 @@
 """`lumigraph segment`: select a part of a scene by strokes on a photograph; extract, delete, recolour or move it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

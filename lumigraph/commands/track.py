@@ -1,7 +1,5 @@
 """`lumigraph track`: find the poses of a moving depth camera while its surroundings are mapped."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 
 Imported where it is typed, because the numbers of the model need the trainer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """`lumigraph view`: show a trained scene in the browser."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Alignment of two sets of cameras by a similarity, and their remaining distances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

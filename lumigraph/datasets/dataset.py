@@ -1,7 +1,5 @@
 """Dataset: the interface of training data of any kind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 

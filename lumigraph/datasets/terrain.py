@@ -1,7 +1,5 @@
 """Procedural terrain: heights, ground and trees of a square of land, for block worlds and for landscapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Block worlds: voxels with labels, and cameras that walk above them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Level sets of numbers on a lattice as triangles: marching cubes of the voxel blocks, for blocks and whole grids."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int

@@ -5,8 +5,6 @@ away:          distances of the points from the camera
 depth:         distances of the surface along the pixels' rays; infinity for empty space, NaN for unmeasured
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

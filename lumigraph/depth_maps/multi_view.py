@@ -1,7 +1,5 @@
 """Multi-view stereo: a depth map of each photograph, by coarse-to-fine PatchMatch, with a consistency check."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

@@ -1,7 +1,5 @@
 """Optical flow by OpenCV's DIS: coarse-to-fine inverse search of patches, refined variationally (Kroeger 2016)."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8

@@ -1,7 +1,5 @@
 """Depth maps of any lens as depth maps of pinholes: one, or the faces of a cube around the camera."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

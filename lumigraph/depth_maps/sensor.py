@@ -1,7 +1,5 @@
 """Sensor depth: weight of each pixel, and checks of a capture's depth."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import lru_cache

@@ -4,8 +4,6 @@ A point at the left pixel (x, y) is at (x - d, y) on the right. With the baselin
 d0 between the columns of both principal points, its distance along the axis is z = b f / (d + d0).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -148,7 +146,7 @@ def sharpened(
     return torch.where(near, found - moved[..., 0], found)
 
 
-def jump_penalties() -> UInt8[Tensor, 256]:
+def jump_penalties() -> UInt8[Tensor, "256"]:
     """P2 for each difference of grey levels: less at edges, likely depth edges too (Hirschmüller 2008, eq. 14)."""
     return (JUMP_PENALTY * torch.exp(-torch.arange(256) / JUMP_EDGE)).clamp_min(MIN_JUMP_PENALTY).to(torch.uint8)
 

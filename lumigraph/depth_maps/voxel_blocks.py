@@ -1,7 +1,5 @@
 """Voxel hashing (Nießner et al. 2013): depth maps fused into blocks of 8³ voxels, allocated near surfaces alone."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 The way of conversion follows from capabilities, so that a new method needs no entry here.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """Parts: what strokes select of a scene is extracted, deleted, recoloured or moved; a cloud is cleaned or cropped."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ the convex hull in place of a shape.
 A method with a lower score shows nothing of its data that these do not show; `below` says so in a sentence.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

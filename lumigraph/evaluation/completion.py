@@ -1,7 +1,5 @@
 """Shape completion of held-out shapes from partial evidence, compared with retrieval of the best training shape."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Georeferencing by control points: places that a surveyor has measured and that photographs show."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

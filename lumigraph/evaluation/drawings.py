@@ -1,7 +1,5 @@
 """Generated objects compared with photographs: FID and KID, and cameras of both."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ The code of a photograph outside the training set is unknown, and one fitted to 
 (Martin-Brualla et al. 2021, section 5).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

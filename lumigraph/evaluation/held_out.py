@@ -1,7 +1,5 @@
 """Kinds of held-out views of a dynamic capture: new cameras, new times, or both."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor

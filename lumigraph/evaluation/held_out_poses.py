@@ -6,8 +6,6 @@ have a frame of their own, so held-out cameras have other poses in it, and a pic
 badly.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

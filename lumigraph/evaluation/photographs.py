@@ -1,7 +1,5 @@
 """Examination of a run's training photographs: residuals of their renderings, findings, and the five worst."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext

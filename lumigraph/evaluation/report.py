@@ -1,7 +1,5 @@
 """Report: a run on one self-contained HTML page with figures, film, curves, contact sheet and settings."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Evaluate a run or a collection under the protocol for its kind of dataset, and write the results."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +18,9 @@ from ..datasets.world import BlockWorld
 from ..errors import LumigraphError, LumigraphWarning
 from ..figures import save_picture
 from ..files import claim, refuse_link, scene_name, write_json
+from ..gaussians.cloud import needle_share
 from ..method import Method
+from ..method.capabilities import HasGaussians, can, needs
 from ..metrics import Score
 from ..metrics.lpips import Lpips, load_lpips, named_files
 from ..run import Trained
@@ -102,6 +102,9 @@ def evaluate_run(
         "evaluated_on": str(method.device),
         "versions": run.settings.versions,
     }
+    if can(method, HasGaussians):
+        cloud = needs(method, HasGaussians).gaussians()
+        result["cloud"] = {"gaussians": len(cloud), "needles": needle_share(cloud)}
     if tracks(method):
         assert isinstance(data, Scene)
         followed = Followed.of(method, data)

@@ -3,8 +3,6 @@
 There are no photographs to compare with.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Evaluate a text-to-3D scene: views not used in training, scored by the guidance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

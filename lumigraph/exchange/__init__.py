@@ -14,7 +14,7 @@ import torch
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_bytes, write_json
 from ..files.marks import is_ours
-from ..files.names import natural
+from ..files.names import counted, natural
 from ..files.partials import remove
 from ..files.ply import read_header
 from ..files.reading import reading, reads
@@ -40,6 +40,7 @@ SUFFIXES = tuple(name for name in WRITERS if name not in usd.SUFFIXES)  # that a
 PLACED = (".glb", *usd.SUFFIXES)  # formats with a place of their own for an offset
 FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
 TRAINED = "point_cloud/iteration_*/point_cloud.ply"
+SURFACES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")  # of files that may hold meshes
 OFFSET = "offset.json"  # beside a file, or in a folder
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
@@ -177,6 +178,17 @@ def holds_points(path: Path | str) -> bool:
         return False
     here = {name for names in read_header(path).properties.values() for name in names}
     return not here & {*ply.COLOUR, *ply.OPACITY, *ply.SCALE, *ply.ROTATION, "packed_position"}
+
+
+def refuse_several(folder: Path) -> None:
+    """Raise LumigraphError for a folder that holds files of Gaussians and no other meshes or points."""
+    found = sorted(folder.iterdir(), key=lambda file: natural(file.name)) if folder.is_dir() else []
+    splats = [file for file in found if file.is_file() and is_splat_file(file) and not holds_points(file)]
+    if splats and not any(file.suffix.lower() in SURFACES for file in {*found} - {*splats}):
+        raise LumigraphError(
+            f"{folder} holds {counted(len(splats), 'file')} of Gaussians, such as {splats[0].name}; name one, or "
+            "several in `lumigraph compose`; frames of a moving cloud are numbered .ply files alone"
+        )
 
 
 def names_splats(path: Path | str) -> bool:

@@ -133,6 +133,8 @@ class Bundle:
         self.size = len(data)
         with reading(path, "is no archive, or a part of one", "copy it again"):
             self._archive = zipfile.ZipFile(io.BytesIO(data))
+        folders = {name.rpartition("/")[0] for name in self._archive.namelist() if not name.startswith("__MACOSX/")}
+        self._folder = f"{folder}/" if len(folders) == 1 and (folder := folders.pop()) else ""  # that was zipped whole
 
     def read(self, name: str) -> bytes:
         """Read a top-level file. Raises LumigraphError if it is missing, damaged or unpacks to an implausible size."""
@@ -141,10 +143,11 @@ class Bundle:
             if Path(name).name != name or file.is_symlink() or not file.is_file():
                 raise LumigraphError(f"{self.path} lacks the file {format_value(name)}; copy the whole folder again")
             return file.read_bytes()
-        if name not in self._archive.namelist():
+        inner = self._folder + name
+        if inner not in self._archive.namelist():
             raise LumigraphError(f"{self.path} lacks the file {format_value(name)}; copy or download it again")
         with reading(f"{self.path}: {format_value(name)}", "is damaged", "download it again"):
-            about = self._archive.getinfo(name)
+            about = self._archive.getinfo(inner)
             if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
                 size = f"{about.file_size:,} bytes"
                 raise LumigraphError(f"{self.path}: {format_value(name)} would unpack to {size}; download it again")

@@ -8,28 +8,21 @@ from __future__ import annotations
 
 import json
 import struct
-import warnings
-from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import unquote
 
 import msgspec
 import numpy as np
 
-from ..errors import LumigraphError, LumigraphWarning
+from ..errors import LumigraphError
 from ..files import from_json
 from ..files.ranges import Coordinate, Tally, between, format_value, typed
 from ..files.reading import reading
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
-PACKINGS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")  # of vertices
-KTX2 = "KHR_texture_basisu"
-MAX_JSON_BYTES = 1 << 24
-FAN = 6  # a mode of triangles
 VERTICES, INDICES = 34962, 34963  # section 5.11.5: what a part of the buffer is for
 KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # 3.6.2.2
 NUMBERS = {np.dtype(kind): number for number, kind in KINDS.items()}
@@ -146,6 +139,7 @@ class Animation(msgspec.Struct, rename="camel"):
 class TextureLink(msgspec.Struct, rename="camel", frozen=True):
     index: Index
     tex_coord: Index = 0
+    extensions: dict[str, Any] = {}
 
 
 class BaseColour(msgspec.Struct, rename="camel", frozen=True):
@@ -240,90 +234,8 @@ def _accessor(view: int, column: Column) -> dict[str, Any]:
     return fields
 
 
-def refuse_compressed(path: Path) -> None:
-    """Raise LumigraphError for glTF whose meshes are packed by an extension."""
-    with open(path, "rb") as file:
-        head = file.read(HEADER.size + CHUNK.size)
-        length = MAX_JSON_BYTES
-        if head[:4] == MAGIC and len(head) == HEADER.size + CHUNK.size:
-            length, head = CHUNK.unpack_from(head, HEADER.size)[0], b""
-        text = head + file.read(min(length, MAX_JSON_BYTES))
-    if found := [name for name in PACKINGS if f'"{name}"'.encode() in text]:
-        raise LumigraphError(
-            f"{path} is packed by {' and '.join(found)}, which is not read; export it without compression, "
-            "for instance from Blender, which opens it"
-        )
-    if f'"{KTX2}"'.encode() in text:
-        told = f"{path} has textures of KTX2, which are not read; colours are those of its materials"
-        warnings.warn(told, LumigraphWarning, 3)
-
-
-def plain(path: Path) -> bytes:
-    """A .glb or .gltf as one .glb whose positions are floats and whose faces are lists of triangles, for a reader that
-    knows neither sparse nor normalised numbers nor fans. Raises LumigraphError for a file that it leads to and is none.
-    """
-    data, binary, text = path.read_bytes(), b"", b""
-    if data[:4] == MAGIC:
-        size = CHUNK.unpack_from(data, HEADER.size)[0]
-        text, binary = data[HEADER.size + CHUNK.size :][:size], data[HEADER.size + 2 * CHUNK.size + size :]
-    about, whole, starts = from_json(text or data, path), bytearray(), []
-    for buffer in about.get("buffers", []):
-        starts.append(len(whole))
-        whole += binary if buffer.get("uri") is None else linked(path, buffer["uri"])
-        whole += bytes(-len(whole) % 4)
-    for view in about.get("bufferViews", []):
-        view["byteOffset"] = view.get("byteOffset", 0) + starts[view.get("buffer", 0)]
-        view["buffer"] = 0
-    for image in about.get("images", []):
-        image |= {"uri": unquote(image["uri"])} if not image.get("uri", "data:").startswith("data:") else {}
-    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
-    file, done = File(path, packed(about, bytes(whole))), set()
-    for primitive in (x for mesh in about.get("meshes", []) for x in mesh.get("primitives", [])):
-        place = primitive.get("attributes", {}).get("POSITION")
-        if place is None:
-            continue
-        accessor = file.accessor(place)
-        if place not in done and (accessor.sparse is not None or accessor.component_type != NUMBERS[np.dtype("<f4")]):
-            about["accessors"][place] = appended(about, whole, file.numbers(place, (3,)), "VEC3")
-            done.add(place)
-        if primitive.get("mode") == FAN:
-            count, own = accessor.count, primitive.get("indices")
-            order = np.arange(count) if own is None else file.numbers(own, (1,))[:, 0].astype(np.int64)
-            fan = np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], 1).astype("<u4").reshape(-1, 1)
-            primitive |= {"mode": 4, "indices": len(about["accessors"])}
-            about["accessors"].append(appended(about, whole, fan, "SCALAR"))
-    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
-    return packed(about, bytes(whole))
-
-
-def linked(path: Path, uri: str) -> bytes:
-    """Bytes of a buffer in the text itself, or in a file beside it."""
-    if uri.startswith("data:"):
-        return b64decode(uri.partition(",")[2])
-    file = path.parent / unquote(uri)
-    if not file.is_file():
-        raise LumigraphError(f"{path} keeps its numbers in {file}, which does not exist; copy it too, or export a .glb")
-    return file.read_bytes()
-
-
-def appended(about: dict[str, Any], whole: bytearray, values: np.ndarray, shape: str) -> dict[str, Any]:
-    """Accessor of values that are appended to the buffer."""
-    about["bufferViews"].append({"buffer": 0, "byteOffset": len(whole), "byteLength": values.nbytes})
-    whole += values.tobytes()
-    kind, view = NUMBERS[values.dtype], len(about["bufferViews"]) - 1
-    return {"bufferView": view, "componentType": kind, "count": len(values), "type": shape}
-
-
-def packed(about: dict[str, Any], buffer: bytes) -> bytes:
-    """Bytes of a .glb file."""
-    text = json.dumps(about).encode()
-    text, buffer = text + b" " * (-len(text) % 4), buffer + bytes(-len(buffer) % 4)
-    chunks = CHUNK.pack(len(text), JSON) + text + (CHUNK.pack(len(buffer), BINARY) + buffer if buffer else b"")
-    return HEADER.pack(MAGIC, 2, HEADER.size + len(chunks)) + chunks
-
-
 class File:
-    """An opened .glb file: its JSON `about`, and the numbers of its accessors.
+    """An opened .glb file: its JSON `about`, and the numbers of its accessors. pixels: decoded textures, by number
 
     Raises LumigraphError for an invalid or truncated file, and for references to other files.
     """
@@ -332,6 +244,7 @@ class File:
 
     def __init__(self, path: Path, data: bytes | None = None):
         self.path, data = path, path.read_bytes() if data is None else data
+        self.pixels: dict[int, np.ndarray | None] = {}
         if len(data) < HEADER.size + CHUNK.size or data[:4] != MAGIC:
             raise LumigraphError(f"{path} is no .glb file, for it does not begin like one; name another one")
         _, version, size = HEADER.unpack_from(data)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.ply import Header, columns, read_header, read_rows, write_rows
 from ..gaussians import Gaussians
+from ..kernels.spherical_harmonics import K00
 from .checks import FLATNESS, check_room
 from .codes import array, cloud
 
@@ -35,6 +36,7 @@ def is_antialiased(header: Header) -> bool:
 MEAN = ["x", "y", "z"]
 NORMAL = ["nx", "ny", "nz"]
 COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]
+RGB = ["red", "green", "blue"]  # bytes in the place of COLOUR, as nerfstudio's --ply-color-mode rgb writes them
 OPACITY = ["opacity"]
 SCALE = ["scale_0", "scale_1", "scale_2"]
 FLAT = "scale_2"  # the axis that 2DGS (Huang 2024) has none of
@@ -42,6 +44,7 @@ FILTER = "filter_3D"  # of Mip-Splatting
 MOTION = re.compile(r"trbf_(center|scale)|motion_\d+|omega_\d+")  # of Spacetime Gaussians
 KNOWN_ELEMENTS = ("face", "chunk", "sh")
 ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
+MAX_REST = 15  # harmonics beyond the constant, of degree 3
 
 
 def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaussians:
@@ -52,8 +55,10 @@ def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaus
     header = header or read_header(path)
     here = header.properties.get("vertex", [])
     flat = FLAT not in here and {*SCALE} - {FLAT} <= {*here}
-    scales = SCALE[:2] if flat else SCALE
-    missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *scales, *ROTATION] if name not in here]
+    scales = [name for name in SCALE if name in here] if flat or {*SCALE} & {*here} == {*SCALE[:1]} else SCALE
+    colours = RGB if {*RGB} <= {*here} and not {*COLOUR} & {*here} else COLOUR
+    refuse_networks(path, here)
+    missing = [name for name in [*MEAN, *colours, *OPACITY, *scales, *ROTATION] if name not in here]
     if not {*COLOUR, *OPACITY, *SCALE, *ROTATION} & {*here}:
         raise LumigraphError(
             f"{path} holds {header.counts.get('vertex', 0)} points and no Gaussians, for it has neither scales nor "
@@ -72,6 +77,9 @@ def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaus
     rows = read_rows(path, ["vertex"], header)["vertex"]
     doubles = all(rows.dtype[name].itemsize == 8 for name in MEAN)
     log_scales, logits = columns(rows, scales), columns(rows, OPACITY)[:, 0]
+    log_scales = np.repeat(log_scales, 3, 1) if len(scales) == 1 else log_scales
+    plain = columns(rows, colours)
+    plain = (plain / 255 - 0.5) / K00 if colours is RGB else plain
     if flat:
         log_scales = np.concatenate([log_scales, log_scales.min(1, keepdims=True) + np.float32(math.log(FLATNESS))], 1)
     if FILTER in here:
@@ -81,16 +89,32 @@ def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaus
         columns(rows, ROTATION),
         log_scales,
         logits,
-        np.concatenate([columns(rows, COLOUR)[:, None], by_coefficient(columns(rows, rest))], 1),
+        np.concatenate([plain[:, None].astype(np.float32), by_coefficient(columns(rows, rest))[:, :MAX_REST]], 1),
         is_antialiased(header),
     )
 
 
+def refuse_networks(path: Path, here: list[str]) -> None:
+    """Raise LumigraphError for Gaussians of which a network or a time decides, beside the file."""
+    if any(name.startswith("f_anchor_feat") for name in here):
+        raise LumigraphError(
+            f"{path} holds anchors of Scaffold-GS, whose Gaussians a network in its folder makes for each view; train "
+            "on the photographs here, or export Gaussians there"
+        )
+    if {"t", "scale_t"} <= {*here}:
+        raise LumigraphError(
+            f"{path} holds Gaussians in space and time (4D-GS), and all moments would be shown at once; export one "
+            "moment or a numbered .ply for each frame"
+        )
+
+
 def told(path: Path, header: Header, here: list[str], flat: bool) -> None:
     """Warn of what a file's properties mean beside those of the first release, and of those that are not used."""
-    known = {*MEAN, *NORMAL, *COLOUR, *OPACITY, *SCALE, *ROTATION, FILTER}
+    known = {*MEAN, *NORMAL, *COLOUR, *(() if {*COLOUR} & {*here} else RGB), *OPACITY, *SCALE, *ROTATION, FILTER}
     unused = [x for x in here if x not in known and not x.startswith("f_rest_") and not MOTION.match(x)]
     found = [f"passed over: {', '.join(unused)}"] if unused else []
+    if f"f_rest_{3 * MAX_REST}" in here:
+        found.append("harmonics of degree 4 are passed over; those of degree 1 to 3 are kept")
     found += [f"Gaussians without {FLAT} are flat, as 2DGS has them; they get a thin third axis"] if flat else []
     if others := [name for name in header.elements if name not in ("vertex", *KNOWN_ELEMENTS)]:
         found.append(f"elements passed over: {', '.join(others)}")
@@ -135,13 +159,13 @@ def save(path: Path, elements: dict[str, np.ndarray], antialiased: bool) -> None
 
 
 def rest_names(path: Path, properties: list[str]) -> list[str]:
-    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 3."""
+    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 4."""
     count = sum(name.startswith("f_rest_") for name in properties)
     names = [f"f_rest_{i}" for i in range(count)]
-    if count not in (0, 9, 24, 45) or not {*names} <= {*properties}:
+    if count not in (0, 9, 24, 45, 72) or not {*names} <= {*properties}:
         raise LumigraphError(
-            f"{path} has {count} properties f_rest_*, where f_rest_0 and on are 0, 9, 24 or 45 for harmonics of degree "
-            "0 to 3; export it with one of these degrees"
+            f"{path} has {count} properties f_rest_*, where f_rest_0 and on are 0, 9, 24, 45 or 72 for harmonics of "
+            "degree 0 to 4; export it with one of these degrees"
         )
     return names
 

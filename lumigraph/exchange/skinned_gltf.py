@@ -6,7 +6,6 @@ skeleton here is rigid, so bones whose scale is animated are refused.
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from PIL import Image
 
-from ..color.srgb import srgb_from_linear
 from ..datasets.skeleton import ROOT, BonePose, Skeleton
 from ..errors import LumigraphError
 from ..files.reading import reads
 from . import gltf
 from .glb import node_matrix
+from .unpacked_gltf import base_colours, packed, unpacked
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # to +z
 SCALE_TOLERANCE = 0.02  # relative, of the scale of a bone that counts as constant
@@ -125,8 +123,7 @@ class _Nodes:
 @reads("is damaged", "export it again")
 def read_character(path: Path) -> SkinnedCharacter:
     """The first skinned mesh of a file with its bones and animations. Raises LumigraphError for a file without one."""
-    gltf.refuse_compressed(path)
-    file = gltf.File(path)
+    file = gltf.File(path, packed(*unpacked(path)))
     about = file.about
     index = next((i for i, node in enumerate(about.nodes) if node.mesh is not None and node.skin is not None), None)
     if index is None:
@@ -198,30 +195,9 @@ def mesh_of(file: gltf.File, mesh: int, place: Int[np.ndarray, " bone"]) -> tupl
         vertices.append(points)
         weights.append(own)
         faces.append(corners + begin)
-        colours.append(colours_of(file, primitive, corners))
+        colours.append(base_colours(file, primitive, corners, SPOTS))
         begin += len(points)
     return tuple(np.concatenate(part) for part in (vertices, faces, weights, colours))
-
-
-def colours_of(file: gltf.File, primitive: gltf.Primitive, corners: Int[np.ndarray, "face 3"]) -> np.ndarray:
-    """Mean colour of each triangle by material and texture, sRGB-encoded."""
-    about = file.about
-    base = gltf.BaseColour()
-    if primitive.material is not None:
-        base = file.one(about.materials, primitive.material, "material").pbr_metallic_roughness
-    factor = srgb_from_linear(np.array(base.base_color_factor[:3], float))
-    flat = np.broadcast_to(factor * 255, (len(corners), 3))
-    link = base.base_color_texture
-    if link is None or f"TEXCOORD_{link.tex_coord}" not in primitive.attributes:
-        return flat.round().clip(0, 255).astype(np.uint8)
-    source = file.one(about.textures, link.index, "texture").source
-    with Image.open(io.BytesIO(file.picture(source or 0))) as image:
-        pixels = np.asarray(image.convert("RGB"), float)
-    uv = file.numbers(primitive.attributes[f"TEXCOORD_{link.tex_coord}"], (2,))[corners]
-    spots = np.einsum("sc,fcu->fsu", SPOTS, uv) % 1.0
-    height, width = pixels.shape[:2]
-    column, row = (spots * [width, height]).astype(int).clip(0, [width - 1, height - 1]).transpose(2, 0, 1)
-    return (pixels[row, column].mean(1) * factor).round().clip(0, 255).astype(np.uint8)
 
 
 def clip_of(file: gltf.File, animation: gltf.Animation) -> AnimationClip:

@@ -1,7 +1,5 @@
 """Convex decomposition of a mesh for collision detection in game engines."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..datasets.mesh import Mesh

@@ -1,7 +1,5 @@
 """Depth maps of photographs as a scene on disk: flat pictures, 16-bit depth, cameras, and a contact sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

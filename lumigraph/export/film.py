@@ -1,7 +1,5 @@
 """A flight through a trained scene: colour and depth, as films and as pictures."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence

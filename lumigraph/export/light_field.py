@@ -1,7 +1,5 @@
 """Two-plane light fields of any method: a grid of cameras on a plane, sheared to a common focal plane."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -5,8 +5,6 @@ The programs in web/ are built from the folder `web` of the repository. Pages wi
 and controls) before their own program; that of clouds has Spark. Programs and data are compressed in the page.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import gzip

@@ -8,8 +8,6 @@ Omnidirectional stereo is a panorama for each eye. The rays of both eyes are tan
 fades.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -4,8 +4,6 @@ A probe renders the six faces of a cube. Pixels are decoded to linear light, so 
 weighted by their solid angle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -91,10 +89,7 @@ def export_probes(loaded: Loaded, path: Path, options: ProbesOptions = ProbesOpt
 @torch.no_grad()
 @at_work()
 def bake_probes(
-    method: Method,
-    cameras: Camera | None,
-    box: tuple[Vector, Vector],
-    options: ProbesOptions = ProbesOptions(),
+    method: Method, cameras: Camera | None, box: tuple[Vector, Vector], options: ProbesOptions = ProbesOptions()
 ) -> ProbeGrid:
     """Probes inside a box of the scene's frame, in the frame of exports.
 

@@ -5,8 +5,6 @@ triangle, between whose centres a GPU interpolates as between vertices. No libra
 the layer in the archive is text.
 """
 
-from __future__ import annotations
-
 import io
 import tempfile
 import zipfile

@@ -1,7 +1,5 @@
 """Figures: colour maps, contact sheets, charts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

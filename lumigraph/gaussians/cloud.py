@@ -21,6 +21,7 @@ from ..geometry import multiply, to_quaternion
 ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isolation
 BAND_0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
 EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
+NEEDLE_RATIO = 10.0  # of the largest deviation to the second, beyond which a Gaussian is a needle
 ROUNDING = 0.01  # of a Gaussian's size, which a centre may be off by
 EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 
@@ -133,6 +134,12 @@ def joined(clouds: Sequence[Gaussians]) -> Gaussians:
     columns = {name: torch.cat([getattr(x, name) for x in clouds]) for name in names}
     harmonics = torch.cat([pad(x.harmonics, (0, 0, 0, coefficients - x.harmonics.shape[1])) for x in clouds])
     return Gaussians(**columns, harmonics=harmonics, antialiased=majority)
+
+
+def needle_share(gaussians: Gaussians) -> float:
+    """Share of needles: Gaussians whose largest deviation is over NEEDLE_RATIO times their second; 0 without any."""
+    ordered = gaussians.log_scales.sort(-1).values
+    return float((ordered[:, 2] - ordered[:, 1] > math.log(NEEDLE_RATIO)).float().mean().nan_to_num())
 
 
 def cleaned(gaussians: Gaussians, crop: Crop | None = None, max_scale: float | None = None) -> Gaussians:

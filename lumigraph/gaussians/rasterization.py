@@ -3,12 +3,11 @@
 Code that calls `gsplat.rasterization` runs without CUDA by importing it from here.
 """
 
-from __future__ import annotations
-
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import kernels
@@ -21,9 +20,9 @@ from ..system.work import at_work
 from .splatting import view_of
 
 MAX_DEGREE = 3
-RADIUS_DEVIATIONS = 3.0  # of a footprint, as meta["radii"] counts
+RADIUS_DEVIATIONS = 3.33  # of a footprint at most, as meta["radii"] counts; there exp(-r^2 / 2) is 1/255
 MIN_OPACITY = 1e-10  # of a pixel whose depth is divided by it
-Mode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
 
 @at_work()
@@ -45,10 +44,10 @@ def rasterization(
     packed: bool = True,
     tile_size: int = 16,
     backgrounds: Float[Tensor, "camera channel"] | None = None,
-    render_mode: Mode = "RGB",
+    render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    rasterize_mode: str = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
@@ -67,16 +66,20 @@ def rasterization(
     far_plane:  Gaussians with centres beyond are not rendered
     radius_clip: nor are those of at most so many pixels
     eps2d:      square pixels added to each footprint
-    render_mode: colours, accumulated depth D, expected depth ED = D / alpha; depth is the last channel
-    packed, tile_size, channel_chunk, segmented: accepted, and without effect on the result
+    render_mode: one of MODES: colours, accumulated depth D, expected depth ED = D / alpha; depth is the last channel
+    rasterize_mode: "classic" or "antialiased" (Yu 2024, eq. 9)
+    packed: the dictionary has a row for each pair of a camera and a Gaussian that it sees, else (C, N, ...)
+    sparse_grad, tile_size, channel_chunk, segmented: accepted, and without effect on the result
 
-    Returns pictures, opacities, and a dictionary: "means2d" (C, N, 2), which may retain its gradient, "radii"
-    (C, N, 2) in whole pixels, "depths", "conics", "opacities", "width", "height", "n_cameras"; zeros for Gaussians that
-    are invisible to a camera. Opacity of one Gaussian at a pixel is at most 0.99 (Kerbl 2023), where gsplat has 0.999.
+    Returns pictures, opacities, and a dictionary: "means2d", which may retain its gradient, "radii" in whole pixels,
+    "depths", "conics", "opacities", "width", "height", "n_cameras" and what strategies of gsplat read. Packed, it has
+    "camera_ids" and "gaussian_ids" of its rows; otherwise these are None, and Gaussians that are invisible to a camera
+    have zeros. Opacity of one Gaussian at a pixel is at most 0.99 (Kerbl 2023), where gsplat has 0.999.
     Raises LumigraphError for options that the kernels do not have.
     """
     refused = {
-        "sparse_grad": sparse_grad,
+        f"render_mode={render_mode!r}": render_mode not in MODES,
+        f"rasterize_mode={rasterize_mode!r}": rasterize_mode not in ("classic", "antialiased"),
         "absgrad": absgrad,
         "distributed": distributed,
         f"camera_model={camera_model!r}": camera_model != "pinhole",
@@ -103,30 +106,36 @@ def rasterization(
         centres, conics, depths, _, alphas = kernels.project(
             *seen, scales, opacities, unused, view, 1, eps2d, compensate
         )
-        radii = radii_of(conics.detach())
+        radii = radii_of(conics.detach(), alphas.detach())
         shown = (depths < far_plane) & (radii.amax(-1) > radius_clip) if len(means) else alphas > 0
         projected.append((centres, conics, depths, torch.where(shown, alphas, 0.0), radii * shown[:, None]))
     centres, conics, depths, alphas, radii = (torch.stack(each) for each in zip(*projected, strict=True))
+    meta: dict[str, Any] = {"means2d": centres, "radii": radii, "depths": depths, "conics": conics, "opacities": alphas}
+    meta |= dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
+    rows: list[Any] = [slice(None)] * count
+    if packed:
+        cameras, gaussians = (radii > 0).all(-1).nonzero().unbind(-1)
+        meta = {name: value if value is None else value[cameras, gaussians] for name, value in meta.items()}
+        meta |= {"batch_ids": torch.zeros_like(cameras), "camera_ids": cameras, "gaussian_ids": gaussians}
+        rows = [gaussians[cameras == i] for i in range(count)]
+        shares = [int((cameras == i).sum()) for i in range(count)]
+    parts = [
+        meta[name].split(shares) if packed else meta[name] for name in ("means2d", "conics", "opacities", "depths")
+    ]
 
     pictures, opaque = [], []
     for i in range(count):
         values = [colours(colors, means, viewmats[i], i, sh_degree)] if "RGB" in render_mode else []
-        picture, depth, alpha = composited(
-            centres[i],
-            conics[i],
-            alphas[i],
-            depths[i],
-            torch.cat([*values, means.new_zeros(len(means), 0)], -1),
-            (width, height),
-        )
+        own = torch.cat([*values, means.new_zeros(len(means), 0)], -1)[rows[i]]
+        picture, depth, alpha = composited([part[i] for part in parts], own, (width, height))
         if backgrounds is not None:
             picture = over(picture, alpha, backgrounds[i])
         if "ED" in render_mode:
             depth = depth / alpha.clamp_min(MIN_OPACITY)
         pictures.append(torch.cat([picture, depth[..., None]], -1) if "D" in render_mode else picture)
         opaque.append(alpha[..., None])
-    meta: dict[str, Any] = {"means2d": centres, "radii": radii, "depths": depths, "conics": conics, "opacities": alphas}
-    meta |= {"width": width, "height": height, "n_cameras": count}
+    tiles = {"tile_size": tile_size, "tile_width": -(-width // tile_size), "tile_height": -(-height // tile_size)}
+    meta |= {"width": width, "height": height, "n_cameras": count, "n_batches": 1, **tiles}
     return torch.stack(pictures), torch.stack(opaque), meta
 
 
@@ -170,14 +179,13 @@ def colours(
 
 
 def composited(
-    centres: Float[Tensor, "gaussian 2"],
-    conics: Float[Tensor, "gaussian 3"],
-    alphas: Float[Tensor, " gaussian"],
-    depths: Float[Tensor, " gaussian"],
-    values: Float[Tensor, "gaussian channel"],
-    size: tuple[int, int],
+    footprints: Sequence[Tensor], values: Float[Tensor, "gaussian channel"], size: tuple[int, int]
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Values, depth and opacity of each pixel. The kernel composites three values at a time."""
+    """Values, depth and opacity of each pixel. The kernel composites three values at a time.
+
+    footprints: centres, conics, opacities and depths of the Gaussians
+    """
+    centres, conics, alphas, depths = footprints
     channels = values.shape[-1]
     tiles = kernels.tile(centres, conics, alphas, depths, size)
     triples = torch.nn.functional.pad(values, (0, -channels % 3)) if channels else values.new_zeros(len(values), 3)
@@ -185,9 +193,11 @@ def composited(
     return torch.cat([picture for picture, _, _ in seen], -1)[..., :channels], seen[0][1], seen[0][2]
 
 
-def radii_of(conics: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian 2"]:
-    """Three deviations of each footprint along both axes, in whole pixels; zero for an empty one."""
+def radii_of(conics: Float[Tensor, "gaussian 3"], alphas: Float[Tensor, " gaussian"]) -> Int[Tensor, "gaussian 2"]:
+    """Half width and height of each footprint where it adds 1/255, at most RADIUS_DEVIATIONS, in whole pixels; zero for
+    an empty one."""
     xx, xy, yy = conics.unbind(-1)
     determinant = xx * yy - xy * xy
     variance = torch.stack([yy, xx], -1) / determinant.clamp_min(1e-30)[:, None]
-    return torch.where(determinant[:, None] > 0, (RADIUS_DEVIATIONS * variance.sqrt()).ceil(), 0.0)
+    reach = (2 * (alphas * 255).clamp_min(1).log()).sqrt().clamp_max(RADIUS_DEVIATIONS)
+    return torch.where(determinant[:, None] > 0, (reach[:, None] * variance.sqrt()).ceil(), 0.0).int()

@@ -1,8 +1,7 @@
 """Splatting: rendering a cloud of Gaussians for a camera (Kerbl 2023)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -29,19 +28,33 @@ class Splatted:
     """A picture of a cloud, and its footprints (see `kernels.project` and `kernels.rasterize`).
 
     rgb:     colours over black
-    depth:   opacity-weighted sum of depths along the optical axis
+    number:  opacity-weighted sum of one number of each Gaussian, by default its depth
     opacity: accumulated opacity
-    centres, conics, opacities: of each Gaussian's footprint, zero for invisible ones
+    centres, conics, opacities, depths: of each Gaussian's footprint, zero for invisible ones
     tiles:   footprints of each tile, in order
+    stop:    early termination transmittance
+    of_depth: whether `number` sums depths
     """
 
     rgb: Float[Tensor, "height width 3"]
-    depth: Float[Tensor, "height width"]
+    number: Float[Tensor, "height width"]
     opacity: Float[Tensor, "height width"]
     centres: Float[Tensor, "gaussian 2"]
     conics: Float[Tensor, "gaussian 3"]
     opacities: Float[Tensor, " gaussian"]
+    depths: Float[Tensor, " gaussian"]
     tiles: Tiles
+    stop: float
+    of_depth: bool
+
+    @cached_property
+    def depth(self) -> Float[Tensor, "height width"]:
+        """Opacity-weighted sum of depths along the optical axis; a second pass where `number` is of something else."""
+        return (
+            self.number
+            if self.of_depth
+            else self.composited(self.rgb.new_zeros(len(self.depths), 3), self.depths, self.stop)[1]
+        )
 
     def composited(
         self, vectors: Float[Tensor, "gaussian 3"], numbers: Float[Tensor, " gaussian"], stop: float
@@ -60,20 +73,27 @@ class Splatted:
 
 
 def splat(
-    cloud: Gaussians, view: kernels.View, bands: int = 4, stop: float = 1e-4, blur: float = FOOTPRINT_BLUR
+    cloud: Gaussians,
+    view: kernels.View,
+    bands: int = 4,
+    stop: float = 1e-4,
+    blur: float = FOOTPRINT_BLUR,
+    numbers: Float[Tensor, " gaussian"] | None = None,
 ) -> Splatted:
-    """Project, tile, rasterise; differentiable in the cloud.
+    """Project, tile, rasterise; differentiable in the cloud and the numbers.
 
-    bands: of the harmonics in use, at most as many as there are
-    stop:  early termination transmittance
+    bands:   of the harmonics in use, at most as many as there are
+    stop:    early termination transmittance
+    numbers: composited in place of depths
     """
     ellipsoids = cloud.means, cloud.quaternions, cloud.log_scales.exp(), cloud.opacities.sigmoid()
     centres, conics, depths, colours, opacities = kernels.project(
         *ellipsoids, cloud.harmonics, view, min(bands, cloud.degree + 1), blur, cloud.antialiased
     )
     tiles = kernels.tile(centres, conics, opacities, depths, view.size)
-    rgb, depth, opacity = kernels.rasterize(centres, conics, opacities, colours, depths, tiles, stop)
-    return Splatted(rgb, depth, opacity, centres, conics, opacities, tiles)
+    own = depths if numbers is None else numbers
+    rgb, number, opacity = kernels.rasterize(centres, conics, opacities, colours, own, tiles, stop)
+    return Splatted(rgb, number, opacity, centres, conics, opacities, depths, tiles, stop, numbers is None)
 
 
 @at_work()

@@ -5,8 +5,6 @@ lanes, or as many as a tuple `like` is long: the compiler knows its length. With
 code runs on rows of a NumPy array, with bounds checks on loads and stores. Arrays are flat.
 """
 
-from __future__ import annotations
-
 import operator
 
 import numpy as np

@@ -6,8 +6,6 @@ samples are trusted, because checking each would cost as much as the loop. On a 
 checking them would synchronise with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import contextvars
 import importlib

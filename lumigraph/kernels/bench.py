@@ -1,7 +1,5 @@
 """Benchmark of each engine and of the reference on the same device, in one run."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import platform

@@ -6,8 +6,6 @@ RUN/
 └── eval.json, eval.png, renders/ ...   as of any run
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterable

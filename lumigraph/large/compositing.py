@@ -7,8 +7,6 @@ Gaussians in its own cell, and cells do not overlap (Lin 2024, VastGaussian, sec
 section 3.3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -5,8 +5,6 @@ k-means. Each photograph belongs to its nearest centre, and a block's radius is 
 farthest of its photographs, and half-way to the next centre. Two neighbours then overlap by half a radius.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,12 +1,10 @@
 """Open trained or exported models: runs of one field or in blocks, splat files, SNeRG folders and compositions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..exchange import is_moving, is_splat_file, place_of, snerg
-from ..files import is_file, read_json
+from ..exchange import is_moving, is_splat_file, place_of, refuse_several, snerg
+from ..files import exists, is_file, read_json
 from ..files.foreign import about_file
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
@@ -37,6 +35,8 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
         raise LumigraphError(
             about_file(path) or f"{path} is none of the files that open: a splat file, or a composition's JSON"
         )
+    if not exists(path / "config.json"):
+        refuse_several(path)
     return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
 
 

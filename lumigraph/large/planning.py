@@ -1,7 +1,5 @@
 """Create a block run: its folder, the task of every block and a map of the plan, before any training."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace

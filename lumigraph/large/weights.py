@@ -1,7 +1,5 @@
 """Weights of blocks in a picture and at a point, and visibility (Tancik et al. 2022, Block-NeRF, section 4.3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -9,8 +9,6 @@ A finished block is skipped, a block with a state continues, any other begins. S
 loss of a process or a machine.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterator

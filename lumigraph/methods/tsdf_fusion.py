@@ -20,8 +20,8 @@ from ..datasets.scene import Frame, Photograph, Scene
 from ..depth_maps import DepthMap, VoxelBlocks, release_weight, render_depth_maps, sensor_faults, trust_of
 from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import NonNegative, Positive, Seed, Share, between
-from ..method import Descend, RayMethod
+from ..files.ranges import NonNegative, Positive, Share, between
+from ..method import BaseConfig, Descend, RayMethod
 from ..method.depth import DEPTH_DEVIATION, DEPTH_LAYER, DEVIATION_LAYER
 from ..system.memory import free_memory
 
@@ -35,7 +35,7 @@ SAMPLE_WEIGHT, SENSOR_SPAN = 3.0, (0.4, 4.0)  # of the release's weight: that of
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the released program for the Kinect (its parameter file; voxels of 4 mm are those of sec. 6)."""
 
     voxel_size: Length = 0.004  # edge of a voxel, in units of the capture (metres); 0: a 256th of the box of interest
@@ -46,7 +46,6 @@ class Config:
     max_depth: Length = 3.0  # in units of the capture, beyond which depth is left out; 0: none
     trusted_depth: Length = 0.0  # units of the capture to which depth counts in full, weighted by angle; 0: all
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 BY_ANGLE = Config(truncation=4.0, truncation_growth=0.0, weighting="angle", max_depth=0.0)  # for any unit and range

@@ -1,7 +1,5 @@
 """Metrics: PSNR, SSIM, LPIPS, IoU, chamfer distance; scores."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """Fine detail of a rendering compared with its photograph. Sharp foliage shifted by a pixel has a low PSNR."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ Features are of a small network of fixed random weights, which ships as code, or
 has: pt_inception-2015-12-05-6726825d.pth, the port of the network of the published figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable

@@ -8,8 +8,6 @@ The weights are not part of this package; they are read from files of the user:
 or from one safetensors file with both under the same names.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of metrics.jsonl: the PSNR of training photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

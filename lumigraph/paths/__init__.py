@@ -1,12 +1,9 @@
 """Camera paths of films: automatic ones, and curves through keyframes."""
 
-from __future__ import annotations
-
 from ..camera import Camera
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from .automatic import PATHS as PATHS
-from .automatic import UP as UP
 from .automatic import Surroundings as Surroundings
 from .automatic import angle_of_view as angle_of_view
 from .automatic import camera_path as camera_path

@@ -5,8 +5,6 @@ around give a full circle; those from one side a sway. Cameras that look outward
 `held_out` are closed or end smoothly.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Opening: initial camera of pages and the viewer, and limits of its movement; the subject of a capture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

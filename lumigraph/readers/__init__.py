@@ -11,7 +11,7 @@ from types import ModuleType
 
 from ..errors import LumigraphError
 from ..files import exists
-from ..files.foreign import about_file, about_poses
+from ..files.foreign import about_file, about_poses, is_pose_file
 from ..files.readers import LISTED, NAMES
 from ..files.reading import reads
 from .assemble import Before as Before
@@ -39,6 +39,7 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     if not folder.is_dir():
         raise LumigraphError(
             about_file(folder)
+            or (about_poses(folder.parent) if is_pose_file(folder) else None)
             or f"{folder} is a file; name the folder that holds the photographs and their poses, "
             f"or find those of a video or of photographs first: lumigraph capture {folder}"
         )
@@ -51,8 +52,17 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
         if reader.recognises(folder):
             return reader
     pictures = len(list_images(folder))
+    below = (one for pattern in ("*/", "*/*/") for one in sorted(folder.glob(pattern)) if one.name[0] not in "._")
+    inner = next((one for one in below if any(reader.recognises(one) for reader in asked.values())), None)
     raise LumigraphError(
-        about_poses(folder)
+        (f"{folder} holds no camera poses itself, and {inner} does; name that folder" if inner else None)
+        or about_poses(folder)
         or f"{folder} holds no camera poses ({pictures} images were found); find the poses first: lumigraph capture "
-        f"{folder}. Looked for {'; '.join(r.EXPECTED_FILES for r in asked.values())}"
+        f"{folder}. Looked for {'; '.join(map(looked_for, asked.values()))}"
     )
+
+
+def looked_for(reader: ModuleType) -> str:
+    """Sentence part on the files by which a reader recognises a folder, for each program that writes such."""
+    pairs = reader.EXPECTED_FILES.items()
+    return "; ".join(f"{' and '.join(files)} ({program})" if files else program for program, files in pairs)

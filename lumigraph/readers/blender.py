@@ -11,7 +11,7 @@ from pathlib import Path
 from .capture import Capture, Shot
 from .transforms import read_frames_file, read_shots
 
-EXPECTED_FILES = "transforms_train.json (Blender, one file per split)"
+EXPECTED_FILES = {"Blender, one file per split": ("transforms_train.json", "transforms_test.json")}
 
 
 def recognises(folder: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -26,8 +27,10 @@ from .points import SparsePoints, read_ply, read_points3d
 BASES = (".", "colmap", "dense", "dense/0", "undistorted")  # folders in which programs leave sparse/ or sparse/0
 PARTS = ("cameras", "images")  # of a whole model; points are in points3D of the same suffix, or in points3D.ply
 MAX_SIDE = 10**5  # pixels
+NUMBER = re.compile(r"[-+.\deE]+")
+POINT_WORDS = 8  # of a line of points3D.txt before its track
 IMAGE_WORDS = 10  # of a line of images.txt; the last is the name, and may have spaces
-EXPECTED_FILES = "sparse/0 with cameras and images, .bin or .txt (COLMAP)"
+EXPECTED_FILES = {"COLMAP": ("sparse/0/cameras.*", "sparse/0/images.*")}
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
 PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -72,13 +75,20 @@ def image_count(place: Path) -> int:
 
 
 def image_lines(lines: Sequence[str]) -> Iterator[int]:
-    """Numbers of the lines of images.txt that describe a photograph; each is followed by a line of its features."""
+    """Numbers of the lines of images.txt that describe a photograph; each is followed by a line of its features, which
+    some programs leave out."""
     number = 0
     while number < len(lines):
         if lines[number].strip() and not lines[number].startswith("#"):
             yield number
-            number += 1
+            number += 1 if has_features(lines, number) else 0
         number += 1
+
+
+def has_features(lines: Sequence[str], number: int) -> bool:
+    """True unless another photograph, whose line ends in a name, follows at once."""
+    following = lines[number + 1].split()[-1:] if number + 1 < len(lines) else []
+    return not following or NUMBER.fullmatch(following[0]) is not None
 
 
 def image_folders(folder: Path, place: Path, names: Sequence[str]) -> dict[int, Path]:
@@ -228,14 +238,18 @@ def read_binary_model(place: Path) -> pycolmap.Reconstruction:
 def read_text_model(place: Path) -> pycolmap.Reconstruction:
     """A model as text. A name is the rest of its line, spaces and all, which pycolmap ends at the first."""
     names: dict[str, str] = {}
+    bare = False
     with tempfile.TemporaryDirectory() as plain:
-        for path in place.glob("*.txt"):
+        for path in sorted(place.glob("*.txt")):
             lines = read_text(path).splitlines()
             for number in image_lines(lines) if path.name == "images.txt" else ():
                 *numbers, name = lines[number].split(maxsplit=IMAGE_WORDS - 1)
                 names[f"{number}.png"] = name.strip()
-                lines[number] = " ".join([*numbers, f"{number}.png"])
-            (Path(plain) / path.name).write_text("\n".join(lines) + "\n")
+                bare = bare or not has_features(lines, number)
+                lines[number] = " ".join([*numbers, f"{number}.png"]) + ("" if has_features(lines, number) else "\n")
+            if bare and path.name == "points3D.txt":  # tracks of features that are not there
+                lines = [" ".join(line.split()[:POINT_WORDS]) for line in lines if not line.startswith("#")]
+            (Path(plain) / path.name).write_text("\n".join(lines) + "\n\n")
         (Path(plain) / "points3D.txt").touch()
         model = pycolmap.Reconstruction(plain)
     for image in model.images.values():

@@ -8,12 +8,15 @@ import unicodedata
 from collections.abc import Callable, Iterable
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 from ..files import is_file
 from .pictures import find_file
 
+MAX_LINK_BYTES = 255  # of the text of a link
 NO_LETTERS = re.compile(r"[\W_]+")
-PHOTOGRAPH_FOLDERS = ("images", "input", "image", "rgb", "photos")  # where photographs lie below a scene
+PHOTOGRAPH_FOLDERS = ("images", "input", "image", "rgb", "photos", "../images", "../resized_images")  # from a scene on
+LOST = re.compile("\ufffd+")  # letters of another encoding than UTF-8
 
 
 def find_named(folder: Path, name: str) -> Path:
@@ -21,15 +24,18 @@ def find_named(folder: Path, name: str) -> Path:
 
     Looked for in turn: the name as it is; its end, from the longest on, below the folder and its folders of
     photographs; the same in other letters (upper and lower case, composed and decomposed accents), and with other signs
-    between letters and digits, as programs replace spaces and brackets.
+    between letters and digits, as programs replace spaces and brackets; the only one that differs in letters which are
+    no UTF-8. Signs of a link (%20) are undone.
     """
     exact = find_file(folder / name)
     if is_file(exact):
         return exact
+    name = unquote(name)
     parts = PurePosixPath(name.replace("\\", "/")).parts
     parts = tuple(part for part in parts if part not in ("/", ".", "..") and not part.endswith(":"))
     ends = [parts[i:] for i in range(len(parts))]
-    places = [folder, *(folder / inner for inner in PHOTOGRAPH_FOLDERS if (folder / inner).is_dir())]
+    inner = (as_folder(folder / one) for one in PHOTOGRAPH_FOLDERS)
+    places = [folder, *(one for one in inner if one.is_dir())]
     for end in ends:
         for place in places:
             if is_file(found := find_file(place.joinpath(*end))):
@@ -39,7 +45,19 @@ def find_named(folder: Path, name: str) -> Path:
             for place in places:
                 if (other := in_other_form(place, end, form)) is not None:
                     return other
+    if "\ufffd" in name:
+        form = re.compile(LOST.sub(".+", re.escape(parts[-1])))
+        found = {x.resolve() for place in places for x in place.iterdir() if form.fullmatch(x.name) and is_file(x)}
+        return found.pop() if len(found) == 1 else exact
     return exact
+
+
+def as_folder(path: Path) -> Path:
+    """The folder to which a link leads that was copied as text, as git and archives do on Windows; else the path."""
+    if path.is_file() and path.stat().st_size <= MAX_LINK_BYTES:
+        target = path.parent / path.read_text("utf-8", "replace").strip()
+        return target if target.is_dir() else path
+    return path
 
 
 def in_other_form(folder: Path, parts: tuple[str, ...], form: Callable[[str], str]) -> Path | None:

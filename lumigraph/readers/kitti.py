@@ -33,7 +33,10 @@ from ..geometry import to_quaternion
 from .capture import Capture, Shot
 from .pictures import list_images
 
-EXPECTED_FILES = "image_02, label_02 and calib (KITTI's tracking), or image_2, calib.txt and poses.txt (its odometry)"
+EXPECTED_FILES = {
+    "KITTI's tracking": ("image_02/", "label_02/", "calib/"),
+    "KITTI's odometry": ("image_2/", "calib.txt", "poses.txt"),
+}
 ODOMETRY_PICTURES, SIDE = "image_2", 4  # and columns of a pose
 PICTURES, LABELS, CALIBRATION, INERTIAL = "image_02", "label_02", "calib", "oxts"
 IGNORED_TYPE = "DontCare"

@@ -29,7 +29,7 @@ from ..files.reading import reading
 from .capture import Capture, Shot
 from .pictures import list_images, measure
 
-EXPECTED_FILES = "pictures of a grid named as in the Stanford light field archive, or by row and column (a light field)"
+EXPECTED_FILES = {"pictures of a grid named as in the Stanford light field archive, or by row and column": ()}
 GANTRY = re.compile(r".*?(\d+)_(\d+)_(-?\d+\.\d+)_(-?\d+\.\d+)_?")
 GRID = re.compile(r"(?P<name>.*?)_?(\d+)[_x](\d+)")
 HCI, PARAMETERS, ABOUT = re.compile(r"input_Cam(\d+)"), "parameters.cfg", "lightfield.json"

@@ -21,7 +21,7 @@ from .numbers import load_array
 from .pictures import list_images, reductions, versions
 from .points import read_points3d
 
-EXPECTED_FILES = "poses_bounds.npy (LLFF)"
+EXPECTED_FILES = {"LLFF": ("poses_bounds.npy",)}
 SIMPLE_RADIAL = 2  # COLMAP's number of the lens that LLFF's own script asks for
 CAMERA_RECORD = struct.Struct("<QiiQQ4d")  # how many, id, model, width, height; focal length, centre and bend
 OTHER_VIEWS = "mv_images"  # of NVIDIA's dynamic scenes (Yoon 2020), whose images/ have a moment each

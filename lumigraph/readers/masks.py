@@ -66,24 +66,28 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
             f"into {folder / MASKS}, silhouettes into {folder / OBJECT_MASKS}"
         )
         capture = replace(capture, notes=[*capture.notes, text])
-    if (folder / MASKS).is_dir():
-        shots = [
-            shot if shot.mask is not None else replace(shot, mask=find_mask(folder / MASKS, shot.name))
-            for shot in shots
-        ]
-        warn_unmatched(folder / MASKS, any(shot.mask is not None for shot in shots))
-    if (folder / OBJECT_MASKS).is_dir():
-        found = [replace(shot, alpha=find_mask(folder / OBJECT_MASKS, shot.name)) for shot in shots]
+    masks, silhouettes, labels = (in_any_case(folder, name) for name in (MASKS, OBJECT_MASKS, LABELS))
+    if masks.is_dir():
+        shots = [shot if shot.mask is not None else replace(shot, mask=find_mask(masks, shot.name)) for shot in shots]
+        warn_unmatched(masks, any(shot.mask is not None for shot in shots))
+    if silhouettes.is_dir():
+        found = [replace(shot, alpha=find_mask(silhouettes, shot.name)) for shot in shots]
         there = [shot for shot in found if shot.alpha is not None]
-        warn_unmatched(folder / OBJECT_MASKS, bool(there))
+        warn_unmatched(silhouettes, bool(there))
         if there:
             missing += [f"{OBJECT_MASKS} of {shot.name}" for shot in found if shot.alpha is None]
             shots = there
-    if (folder / LABELS).is_dir():
-        found = [replace(shot, planes=labelled(folder / LABELS, shot.name) | shot.planes) for shot in shots]
-        warn_unmatched(folder / LABELS, any(LABELS in shot.planes for shot in found))
+    if labels.is_dir():
+        found = [replace(shot, planes=labelled(labels, shot.name) | shot.planes) for shot in shots]
+        warn_unmatched(labels, any(LABELS in shot.planes for shot in found))
         shots = found
     return replace(capture, shots=shots, missing=missing)
+
+
+def in_any_case(folder: Path, name: str) -> Path:
+    """The entry of a folder that has a name, in upper or lower case."""
+    exact = folder / name
+    return exact if exact.exists() else next((x for x in folder.glob("*") if x.name.lower() == name), exact)
 
 
 def other_masks(shots: list[Shot], folder: Path) -> Path | None:
@@ -96,9 +100,9 @@ def other_masks(shots: list[Shot], folder: Path) -> Path | None:
     return next((x for x in (*beside, *(folder / name for name in OTHER_MASKS)) if x.exists()), None)
 
 
-def names_beside(photograph: str) -> tuple[str, str]:
+def names_beside(photograph: str) -> tuple[str, ...]:
     """Names, without suffix, that other programs give to the mask beside a photograph."""
-    return f"{photograph}_mask", f"dynamic_mask_{photograph}"
+    return f"{photograph}_mask", f"{photograph}.mask", f"dynamic_mask_{photograph}"
 
 
 def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:

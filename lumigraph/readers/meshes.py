@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,14 @@ from ..datasets.dataset import splits_of
 from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
-from ..exchange.gltf import plain, refuse_compressed
+from ..exchange.unpacked_gltf import plain
+from ..files import is_file
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
 from ..files.reading import reads
 from ..system.memory import ask_for, free_memory
 from ..system.progress import track
+from .finding import find_named
 from .points import colours_of as ply_colours
 from .points import read_vertices
 
@@ -79,13 +81,11 @@ def read_mesh(path: Path) -> Mesh:
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
     suffix, loaded = path.suffix.lower(), None
     if suffix in (".glb", ".gltf"):
-        refuse_compressed(path)
-        beside = trimesh.resolvers.FilePathResolver(str(path))
-        loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb", resolver=beside)
+        loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb")
     elif suffix == ".ply" and not has_texture(path):
         loaded = read_ply(path)
     else:
-        loaded = trimesh.load(path, process=False, file_type=suffix[1:])
+        loaded = trimesh.load(path, process=False, file_type=suffix[1:], resolver=Beside(path))
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
@@ -107,6 +107,24 @@ def read_mesh(path: Path) -> Mesh:
     return made
 
 
+@dataclass(frozen=True)
+class Beside:
+    """Files that an .obj names, wherever `find_named` finds them, options before the name passed over."""
+
+    path: Path
+
+    def get(self, name: str) -> bytes:
+        words = name.split()
+        files = (find_named(self.path.parent, " ".join(words[i:])) for i in range(len(words)))
+        if (found := next(filter(is_file, files), None)) is None:
+            text = f"{self.path} names {name.strip()}, which is not beside it; its colours are left out"
+            warnings.warn(text, LumigraphWarning, stacklevel=2)
+            raise FileNotFoundError(name)
+        return found.read_bytes()
+
+    __getitem__ = get
+
+
 def has_texture(path: Path) -> bool:
     """True if a PLY file names a picture for its surface, as MeshLab writes it; those are read by trimesh."""
     return any(line.startswith("TextureFile") for line in read_header(path).comments)
@@ -116,9 +134,14 @@ def read_ply(path: Path) -> Any:
     """Triangles of a PLY file, its polygons triangulated as fans; its points if it has none."""
     import trimesh
 
-    rows = read_vertices(path, "face")
+    rows = read_vertices(path, "face", "tristrips")
     vertices, faces = rows["vertex"], rows.get("face", np.empty(0, []))
     positions, colours = np.array(columns(vertices, "xyz", np.float64)), ply_colours(vertices)
+    if (strips := rows.get("tristrips")) is not None and len(strips):
+        corners = np.concatenate([np.asarray(x) for x in strips[POLYGONS[0]]])
+        parts = np.split(corners, np.flatnonzero(corners < 0))
+        triangles = trimesh.util.triangle_strips_to_faces([x for part in parts if len(x := part[part >= 0]) > 2])
+        return trimesh.Trimesh(positions, triangles, vertex_colors=colours, process=False)
     name = next((name for name in POLYGONS if name in (faces.dtype.names or ())), None)
     if name is None or not len(faces):
         return trimesh.PointCloud(positions, colours)

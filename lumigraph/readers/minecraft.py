@@ -18,7 +18,7 @@ from ..datasets.world import LABELS
 from ..errors import LumigraphError
 from ..system.progress import track
 
-EXPECTED_FILES = "region files, r.*.*.mca (Minecraft)"
+EXPECTED_FILES = {"region files, r.*.*.mca, of Minecraft": ()}
 LOOKED_FOR = ("r.*.*.mca", "region/r.*.*.mca")
 SUFFIX = ".mca"
 CHUNK, SIDE = 16, 4  # blocks of a chunk and of a section each way; chunks of the part that is read each way

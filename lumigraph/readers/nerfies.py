@@ -1,6 +1,7 @@
 """Captures of dynamic scenes, as Nerfies and HyperNeRF publish them (Park et al. 2021).
 
-dataset.json has the ids of photographs and the split; metadata.json the time of each, as a frame number;
+dataset.json has the ids of photographs and the split, DyCheck's splits/train.json and splits/val.json another one;
+metadata.json the time of each, as a frame number;
 camera/ID.json a camera; scene.json the near and far distance, in units of its `scale`; rgb/2x/ID.png the photograph at
 half size; points.npy points of the static background.
 """
@@ -23,7 +24,7 @@ from .capture import Capture, Shot
 from .numbers import load_array
 from .pictures import find_file
 
-EXPECTED_FILES = "dataset.json, metadata.json and camera/ (Nerfies, HyperNeRF)"
+EXPECTED_FILES = {"Nerfies, HyperNeRF": ("dataset.json", "metadata.json", "camera/")}
 GREY = 128  # of points, whose colours are not in the files
 
 Focal = Annotated[float, between(1e-2, 1e7)]  # pixels
@@ -37,6 +38,13 @@ class PhotographList:
     ids: list[Name]
     train_ids: list[Name] = field(default_factory=list)
     val_ids: list[Name] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class SplitRecord:
+    """Fields of splits/train.json and splits/val.json, as DyCheck (Gao 2022) publishes them."""
+
+    frame_names: list[Name]
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,9 @@ def read(folder: Path) -> Capture:
     near, far = (None if x is None else x / place.scale for x in (place.near, place.far))
     sizes = sorted((int(f.name[:-1]), f) for f in (folder / "rgb").glob("*x") if f.name[:-1].isdecimal())
     testing, learning = set(listed.val_ids), set(listed.train_ids) or set(listed.ids) - set(listed.val_ids)
+    published = [folder / "splits" / f"{split}.json" for split in ("train", "val")]
+    if all(map(is_file, published)):
+        learning, testing = (set(read_json(file, SplitRecord).frame_names) for file in published)
     shots, missing = [], []
     for name in listed.ids:
         files = {factor: find_file(place / name) for factor, place in sizes}

@@ -29,7 +29,7 @@ from .pictures import find_file, measure, readable, stat
 from .seven_scenes import read_matrix
 from .surveyed import registered
 
-EXPECTED_FILES = "traj.txt and results/ (Replica), or color/, depth/ and pose/ (ScanNet), as NICE-SLAM has them"
+EXPECTED_FILES = {"Replica, as NICE-SLAM has it": ("traj.txt", "results/"), "ScanNet": ("color/", "depth/", "pose/")}
 MILLIMETRES = 1e-3
 
 

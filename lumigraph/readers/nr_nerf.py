@@ -19,7 +19,7 @@ from ..files.ranges import Coordinate
 from .capture import Capture, Shot
 from .pictures import list_images
 
-EXPECTED_FILES = "precomputed.json (NR-NeRF)"
+EXPECTED_FILES = {"NR-NeRF": ("precomputed.json",)}
 PoseRow = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 
 

@@ -34,7 +34,11 @@ from .capture import Capture, PixelPlane, Shot
 from .numbers import read_numbers
 from .pictures import find_file, list_images, measure, readable, stat
 
-EXPECTED_FILES = "keyframes/ (Polycam, raw data), metadata.json and rgbd/ (Record3D), or odometry.csv (Stray Scanner)"
+EXPECTED_FILES = {
+    "Polycam, raw data": ("keyframes/cameras/",),
+    "Record3D": ("metadata.json", "rgbd/"),
+    "Stray Scanner": ("odometry.csv", "rgb.mp4"),
+}
 OPENCV = np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera axes
 UP = (0.0, 1.0, 0.0)
 MILLIMETRES = 1e-3

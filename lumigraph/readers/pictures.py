@@ -31,6 +31,7 @@ IMAGE_SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES,
     ".avif", ".jfif", ".jp2",
 )  # fmt: skip
+UNSEEN = (".", "@eadir", "__macosx")  # beginnings of names of hidden files, and of folders of a NAS and of macOS
 LARGE = 64_000_000  # pixels beyond which a JPEG is decoded at a half, a quarter or an eighth, from three final sizes on
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
@@ -57,7 +58,8 @@ def list_images(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in IMAGE_SUFFIXES} and p.is_file())
-    return sorted(p.relative_to(folder).as_posix() for p in files if not p.name.startswith("."))
+    inner = (p.relative_to(folder) for p in files)
+    return sorted(p.as_posix() for p in inner if not any(part.lower().startswith(UNSEEN) for part in p.parts))
 
 
 def reductions(folder: Path) -> dict[int, Path]:
@@ -341,12 +343,15 @@ def masked(
 
 
 def read_grey(path: Path, size: Size, turn: bool) -> np.ndarray:
-    """A mask's brightest channel, times its alpha, as uint8; in its own size, which has the photograph's shape."""
+    """A mask's brightest channel, times its alpha, as uint8, in its own size, which has the photograph's shape. A black
+    picture is its alpha, and of ones and zeros the ones are white."""
     with readable(path), Image.open(path) as image:
         upright = ImageOps.exif_transpose(image) if turn else image
         channels = np.asarray(eight_bits(upright)).astype(np.uint16)
         grey = channels[..., :3].max(-1)
-        grey = grey * channels[..., 3] // 255 if channels.shape[2] == 4 else grey
+        if channels.shape[2] == 4:
+            grey = grey * channels[..., 3] // 255 if grey.any() else channels[..., 3]
+        grey = grey * 255 if grey.max() == 1 else grey
         if not same_shape((grey.shape[1], grey.shape[0]), size):
             raise ValueError(f"its shape {grey.shape[1]}x{grey.shape[0]} is not the image's {size[0]}x{size[1]}")
     return grey.astype(np.uint8)

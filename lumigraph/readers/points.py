@@ -48,10 +48,11 @@ def read_vertices(path: Path, *further: str) -> dict[str, np.ndarray]:
 
 
 def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
-    """red, green and blue of a PLY file's rows, maybe as diffuse_red: integers up to 255 or to 65535, or floats up to 1
-    or to 255. None without them."""
+    """red, green and blue of a PLY file's rows, maybe as diffuse_red or r: integers up to 255 or to 65535, or floats
+    up to 1 or to 255. None without them."""
     here = {*plain_names(rows)}
-    names = next((x for x in (COLOURS, [f"diffuse_{name}" for name in COLOURS]) if {*x} <= here), None)
+    forms = COLOURS, [f"diffuse_{name}" for name in COLOURS], [*"rgb"]
+    names = next((x for x in forms if {*x} <= here), None)
     if names is None:
         return None
     found = np.stack([rows[name] for name in names], -1)

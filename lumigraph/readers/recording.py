@@ -23,7 +23,7 @@ from .capture import Capture, PixelPlane, Shot
 from .nice_slam import pinhole
 from .pictures import list_images, measure, stem
 
-EXPECTED_FILES = "color/ or rgb/, and depth/, without poses (a recording, for `lumigraph track`)"
+EXPECTED_FILES = {"a recording without poses, for `lumigraph track`": ("color/ or rgb/", "depth/")}
 COLOURS, DEPTHS = ("color", "colour", "rgb", "image", "images"), ("depth", "depths", "depth_images")
 MATRICES = (
     "intrinsic/intrinsic_color.txt", "intrinsic_color.txt", "camera-intrinsics.txt", "intrinsics.txt", "intrinsic.txt",

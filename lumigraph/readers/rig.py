@@ -30,7 +30,13 @@ from .capture import Capture, Shot
 from .pictures import list_images, stem, upright_size
 from .transforms import Json, Posed, read_lens, read_pose
 
-EXPECTED_FILES = "cameras' folders with poses_bounds.npy, models.json, intri.yml or cameras_parameters.txt (a rig)"
+EXPECTED_FILES = {
+    "a rig, beside its cameras' folders or films": ("poses_bounds.npy",),
+    "Google's immersive films": ("models.json",),
+    "EasyMocap": ("intri.yml", "extri.yml"),
+    "a rig of Technicolor": ("cameras_parameters.txt",),
+    "Dynamic 3D Gaussians": ("train_meta.json", "ims/"),
+}
 TABLE, MODELS, INTRINSICS, EXTRINSICS = "poses_bounds.npy", "models.json", "intri.yml", "extri.yml"
 PARAMETERS, METADATA = "cameras_parameters.txt", "train_meta.json"
 HELD_OUT = {TABLE: 0, MODELS: 0, PARAMETERS: 10}  # cameras of the published test views, by order

@@ -20,7 +20,7 @@ from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, measure
 
-EXPECTED_FILES = "frame-*.color and frame-*.pose.txt (7-Scenes, 3DMatch)"
+EXPECTED_FILES = {"7-Scenes, 3DMatch": ("frame-*.color.*", "frame-*.pose.txt")}
 POSE_SUFFIX = ".pose.txt"
 KINECT_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])  # as published with 7-Scenes
 

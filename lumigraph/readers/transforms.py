@@ -31,9 +31,10 @@ from .pictures import reductions, upright_size, versions
 from .points import SparsePoints, read_ply, similarity
 
 RESULT_FILE = "capture.json"  # of a folder that `lumigraph capture` made
-EXPECTED_FILES = "transforms.json (instant-ngp, nerfstudio)"
+EXPECTED_FILES = {"instant-ngp, nerfstudio": ("transforms.json",)}
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
+LAST_ROW_TOLERANCE = 1e-3  # of a pose's last row
 MAX_FACT_NUMBERS = 10_000  # numbers per fact of one photograph
 
 # Of a layer, what a frame may call its file: nerfstudio's name or instant-ngp's, and what annotated captures say.
@@ -185,7 +186,9 @@ def about_dialect(path: Path, plain: Json) -> list[str]:
     if unknown := sorted(said - known):
         found.append(f"{path}: passed over: {', '.join(unknown)}")
     shared = {name: value for name, value in plain.items() if name != "frames"}
-    frames = [typed(Posed, shared | frame, path) for frame in plain["frames"] if said & {"k4", "rolling_shutter"}]
+    frames = [
+        typed(Posed, given(shared | frame), path) for frame in plain["frames"] if said & {"k4", "rolling_shutter"}
+    ]
     if any(means_power(frame) for frame in frames):
         found.append(
             f"{path}: k4 without k5 and k6 is read as nerfstudio's, the coefficient of r^8; give all three for OpenCV's"
@@ -221,7 +224,7 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
     """
     folder, shots, missing = path.parent, [], []
     shared = {name: value for name, value in whole.items() if name != "frames"}
-    said = [typed(Posed, shared | frame, f"{path}: {called(frame, i)}") for i, frame in enumerate(whole["frames"])]
+    said = [typed(Posed, given(shared | x), f"{path}: {called(x, i)}") for i, x in enumerate(whole["frames"])]
     names = [about.file_path for about in said]
     for name, frame, about, files in zip(names, whole["frames"], said, find_versions(folder, names), strict=True):
         if not files:
@@ -238,7 +241,7 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
                 lens=lens,
                 size=size,
                 image=files,
-                mask=find_named(folder, about.mask_path) if about.mask_path else within_circle(about, lens, size),
+                mask=named_mask(folder, about.mask_path, missing) or within_circle(about, lens, size),
                 split=split,
                 time=about.time,
                 planes=read_planes(folder, about, lens, missing),
@@ -246,6 +249,19 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
             )
         )
     return shots, missing
+
+
+def named_mask(folder: Path, name: str | None, missing: list[str]) -> Path | None:
+    """Mask of the name that a frame gives; a name of none is added to `missing`."""
+    if not name or is_file(found := find_named(folder, name)):
+        return found if name else None
+    missing.append(name)
+    return None
+
+
+def given(fields_of_frame: Json) -> Json:
+    """Fields without those that are null."""
+    return {name: value for name, value in fields_of_frame.items() if value is not None}
 
 
 def within_circle(about: Posed, lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
@@ -312,6 +328,11 @@ def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
 def read_pose(about: Posed, where: str) -> np.ndarray:
     if len(about.transform_matrix) not in (3, 4):
         raise LumigraphError(f"{where} has no 4x4 transform_matrix of numbers; correct it or remove the frame")
+    if not np.allclose([*about.transform_matrix[3:], (0, 0, 0, 1)][0], (0, 0, 0, 1), atol=LAST_ROW_TOLERANCE):
+        last = ", ".join(f"{x:.4g}" for x in about.transform_matrix[3])
+        raise LumigraphError(
+            f"{where} has a transform_matrix whose last row is {last}, not 0, 0, 0, 1; transpose it, or write it again"
+        )
     pose = np.array(about.transform_matrix[:3], np.float64)
     pose[:, :3] *= OPENCV_FROM_OPENGL
     return pose

@@ -20,7 +20,7 @@ from ..geometry import to_matrix
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
 
-EXPECTED_FILES = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
+EXPECTED_FILES = {"TUM's RGB-D benchmark": ("rgb.txt", "groundtruth.txt")}
 MAX_TIME_DIFFERENCE = 0.02  # seconds between two entries that belong together, as in the benchmark's own tools
 DEPTH_PER_METRE = 5000  # in numbers of a depth picture
 POSE_COLUMNS = 8  # of a trajectory

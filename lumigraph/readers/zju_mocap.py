@@ -28,7 +28,7 @@ from .numbers import load_array
 from .pickled import load_pickled
 from .pictures import readable, stat
 
-EXPECTED_FILES = "annots.npy and new_params/ or params/ (ZJU-MoCap)"
+EXPECTED_FILES = {"ZJU-MoCap": ("annots.npy", "new_params/ or params/")}
 MILLIMETRES = 1000.0
 MAX_NUMBER = 1e9  # in any file, whatever its unit
 TEST_INTERVAL = 30  # frames between those of cameras that test (Peng 2021)

@@ -7,8 +7,6 @@ A new checkpoint is written beside the previous one and renamed when complete; o
 after a rename to a name that readers skip. So a complete checkpoint exists at any time, however the writer ends.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

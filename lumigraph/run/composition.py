@@ -36,8 +36,6 @@ bounds:    two corners of the opaque region, in the canonical frame
 agreement: similarity to the mean shape of the category, 1 for the same
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ compress.json, convert.json    results, in the derived run
 config.json                    `converted`, `inferred`: origin of the run
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Files that open like runs: splat files, moving clouds and SNeRG viewer folders, with cameras around them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

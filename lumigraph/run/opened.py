@@ -1,7 +1,5 @@
 """Opened models: anything that can be opened and rendered, such as a run, a splat file or a composition."""
 
-from __future__ import annotations
-
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable

@@ -1,8 +1,6 @@
 """Record files of a run: cameras.json, poses of its photographs, so that films need no photographs; the lines of
 metrics.jsonl; the contents of eval.json and related files."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field

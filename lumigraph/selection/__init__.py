@@ -3,8 +3,6 @@
 from .descriptors import describe as describe
 from .distilled import Distilled as Distilled
 from .distilled import distil_features as distil_features
-from .growth import GrowthNumbers as GrowthNumbers
-from .growth import grown as grown
 from .networks import feature_network as feature_network
 from .selection import Selection as Selection
 from .strokes import Strokes as Strokes

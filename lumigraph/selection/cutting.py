@@ -1,7 +1,5 @@
 """Splitting of a cloud into a selected part and the rest. Unobserved surfaces are grey, not invented."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

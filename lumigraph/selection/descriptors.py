@@ -5,8 +5,6 @@ unlike its coat. Strokes on each material, and growth in space, compensate; a ne
 fewer strokes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float

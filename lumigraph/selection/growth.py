@@ -4,8 +4,6 @@ Clusters of the features under the strokes, by k-means; each point is matched wi
 smoothed by a bilateral filter on the graph of neighbours, and the part grows from the strokes over neighbours of it.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 
@@ -99,11 +97,7 @@ def bilateral(
 
 
 def walked(
-    weights: csr_matrix,
-    prior: Float[np.ndarray, " point"],
-    wanted: Seeds,
-    unwanted: Seeds,
-    match_weight: float,
+    weights: csr_matrix, prior: Float[np.ndarray, " point"], wanted: Seeds, unwanted: Seeds, match_weight: float
 ) -> Float[np.ndarray, " point"]:
     """Probability that a random walk from each point ends at a wanted seed (Grady 2006), with each point's own match as
     a prior (Grady 2005): the minimum of sum_ij w_ij (x_i - x_j)^2 + c sum_i (x_i - p_i)^2 with x given at the seeds."""

@@ -10,8 +10,6 @@ safetensors  weights `NAME.weight` (out, in, k, k) and `NAME.bias`, in the order
 The features of all photographs are reduced to their first principal components, which the strokes are matched in.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import re

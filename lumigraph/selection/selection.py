@@ -1,7 +1,5 @@
 """Selection: a user's strokes, and the selected part of the scene, with undo."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

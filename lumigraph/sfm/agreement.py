@@ -4,8 +4,6 @@ Mapping keeps inliers and discards the rest, so a wrong model has a small error 
 of two photographs.
 """
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path

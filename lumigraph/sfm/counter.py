@@ -4,8 +4,6 @@ A process of its own, until its standard input ends. Python and COLMAP each brin
 break each other's locks on one file, and its shared memory is then truncated while the other reads it.
 """
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import sys

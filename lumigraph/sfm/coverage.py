@@ -1,7 +1,5 @@
 """Coverage of a subject by photographs: the angle around it, gaps, elevations, and positions for more photographs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

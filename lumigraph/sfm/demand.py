@@ -4,8 +4,6 @@ Measured with COLMAP 4 on one core of about 3 GHz (docs/capture.md): features wi
 pixels, pairs at 1,200 to 12,400 features, mapping of 15 to 60 photographs.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Diagnosis of a capture: outcome for each photograph, reliability of the result, and advice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass

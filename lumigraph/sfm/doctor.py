@@ -1,7 +1,5 @@
 """Findings: faulty photographs of a capture or a run, with evidence and advice."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Two pictures of a capture: cameras and points from above and from the side, and all photographs with remarks."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A scene's folder: photographs, COLMAP's model and transforms.json, in other programs' layout."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Container, Sequence
@@ -33,10 +31,7 @@ PANORAMA_FILE = "panorama.jpg"  # of photographs from one place, which are no sc
 WRITTEN_FILES = (RESULT_FILE, "transforms.json", POINTS_FILE, RAW_FILE, PANORAMA_FILE, *DRAWING_FILES)
 
 # COLMAP's parameters by the names that transforms.json has for them.
-NAMES = {
-    "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-}
+NAMES = {"SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"), "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")}
 
 
 def claim(folder: Path, sources: Sequence[Path]) -> Path:

@@ -1,7 +1,5 @@
 """Georeferencing by GPS: up, metric scale and position on Earth; without GPS only up, from camera orientations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

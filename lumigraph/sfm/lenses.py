@@ -1,7 +1,5 @@
 """Group photographs by lens, and write COLMAP's database with the known parameters of each before matching."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing

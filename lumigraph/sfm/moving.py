@@ -1,7 +1,5 @@
 """Removal of moving features from matching, by epipolar residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass

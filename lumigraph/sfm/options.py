@@ -1,7 +1,5 @@
 """Options of structure from motion, without PyTorch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Pairs of photographs to match: all, neighbours in time, or similar ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path

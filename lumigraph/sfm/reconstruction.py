@@ -1,7 +1,5 @@
 """Reconstruction: from photographs or a video to a folder with poses, in stages."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sqlite3

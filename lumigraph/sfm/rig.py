@@ -1,7 +1,5 @@
 """Rigs: a folder of synchronised videos of static cameras becomes a scene with times."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

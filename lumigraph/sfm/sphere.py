@@ -1,7 +1,5 @@
 """Perspective views of 360-degree panoramas with poses, so that every method can train on them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

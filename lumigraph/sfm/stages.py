@@ -1,7 +1,5 @@
 """Stages of work in a folder, each identified by all of its inputs; finished stages are not repeated."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import signal

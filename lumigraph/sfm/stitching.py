@@ -4,8 +4,6 @@ Photographs differ by a rotation, K R K⁻¹ between their pixels (Szeliski 2006
 rotations follow from the strongest pairs and are then adjusted together with the focal length.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing

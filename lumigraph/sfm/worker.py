@@ -5,8 +5,6 @@ half a second. Progress goes to standard output, a number to a line, and at the 
 go to standard error. The process ends when its standard input does.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -21,8 +21,6 @@
 A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Block worlds as stages: cuboids for the tracer, and cameras that walk above the ground."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 

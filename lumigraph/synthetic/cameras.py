@@ -1,7 +1,5 @@
 """Camera positions of procedural scenes: a dome around an object, a walk within a place."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Captions of plain objects, "a red cube beside a blue ball", and pictures of them: training data of a text-and-image
 model, with held-out pairs of objects."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

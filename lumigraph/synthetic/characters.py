@@ -5,10 +5,8 @@ four static cameras at training times and halfway between two of them, and as sp
 every joint is turned by UNSEEN_TURN degrees about a random axis.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Protocol, runtime_checkable
 
@@ -21,8 +19,10 @@ from ..datasets.skeleton import BonePose, Skeleton, disturbed
 from ..files.ranges import between
 from .cameras import look_at, pinhole, sphere_point
 from .filming import BETWEEN, FRONT, MIN_MOMENTS, timed
+from .shapes import SolidShape
 from .stage import Pictures, SyntheticStage
-from .world import Lamp, Sky, World
+from .textures import Texture
+from .world import Lamp, Material, Object, Pose, Rotation, Sky, World, nested
 
 RADIUS = 3.6  # of the cameras' paths, scene units
 FIELD_OF_VIEW = 32.0  # degrees
@@ -69,6 +69,41 @@ class Character(Protocol):
 
     def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Bounding box in a pose: lowest and highest corner."""
+
+
+class SolidCharacter:
+    """Base of characters whose world holds an object for each shape."""
+
+    def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
+        """Bounding box in a pose: lowest and highest corner."""
+        return self.world(pose).bounds()
+
+    def world(self, pose: Joints) -> World:
+        raise NotImplementedError
+
+
+def moved_shapes(
+    parts: Iterable[tuple[str, SolidShape, Texture, Pose]],
+    names: Sequence[str],
+    rest: Joints,
+    pose: Joints,
+    finish: tuple[float, float],
+) -> World:
+    """Shapes at rest, each moved by the bone of its name, with light. finish: gloss and roughness"""
+    turn = pose[:, :, :3] @ rest[:, :, :3].transpose(0, 2, 1)
+    shift = pose[:, :, 3] - (turn @ rest[:, :, 3:])[:, :, 0]
+    moves = {name: Pose(tuple(shift[i].tolist()), nested(turn[i])) for i, name in enumerate(names)}
+    objects = (
+        Object(shape, Material(texture, *finish), moves[name] @ place, name) for name, shape, texture, place in parts
+    )
+    return World(tuple(objects), (KEY, FILL), SKY)
+
+
+def turned_along(way: np.ndarray) -> Rotation:
+    """Rotation of an upright shape to a unit direction."""
+    side = np.cross([0.0, 1.0, 0.0], way)
+    side /= np.linalg.norm(side)
+    return nested(np.stack([side, np.cross(way, side), way], 1))
 
 
 def photographed(character: Character, size: int, views: int, seed: int, rig: int, jitter_bones: int) -> SyntheticStage:

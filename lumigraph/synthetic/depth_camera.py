@@ -7,8 +7,6 @@ Khoshelham and Elberink's 2012, sec. 3.2): the error of depth grows with its squ
 Nothing is measured in the shadow of the projector, at grazing angles and outside the range.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

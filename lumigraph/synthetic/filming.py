@@ -4,8 +4,6 @@ Two further static cameras are held out. They alternate between training times a
 them: one set of views measures the cost of new cameras and of new times.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated

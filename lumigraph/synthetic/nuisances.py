@@ -7,8 +7,6 @@
 lists the options. Held-out photographs keep their colours, sharpness and poses, and nothing is held out anew.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,6 @@
 """Rendering of a world for a camera: rays through every pixel, traced on all cores, averaged."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -99,17 +98,14 @@ def lit(world: World, camera: Camera, samples: int = 4, lights: int = 32) -> Flo
     """
     assert world.environment is not None
     width, height = camera.size[0].tolist()
-    offsets = torch.from_numpy(hammersley(samples)).to(camera.pose) - 0.5
-    rays = camera.rays((camera.pixels()[:, None] + offsets).reshape(-1, 2))
-    origins, directions, radius = _arrays(rays)
-    table, seen = environment.LightTable.of(world.environment), np.empty((len(rays), 4))
+    rays = _stratified(camera, camera.pixels(), samples)
+    table, seen = environment.LightTable.of(world.environment), np.empty((len(rays[0]), 4))
 
-    def work(first: int) -> None:
-        part = slice(first, first + RAYS_PER_TASK)
-        given = origins[part], directions[part], radius[part] / samples**0.5
-        environment.light(world.arrays, table, *given, first, lights, world.bounces, seen[part])
+    def work(part: slice) -> None:
+        given = (x[part] for x in rays)
+        environment.light(world.arrays, table, *given, part.start, lights, world.bounces, seen[part])
 
-    list(_workers().map(work, range(0, len(rays), RAYS_PER_TASK)))
+    _share_out(work, len(seen))
     pixels = seen.reshape(height, width, samples, 4).sum(2)
     pixels[..., :3] /= np.maximum(pixels[..., 3:], 1)
     pixels[..., 3] /= samples
@@ -123,19 +119,14 @@ def scattered(world: World, camera: Camera, samples: int = 4, along: int = 16) -
     """
     assert world.fog is not None
     width, height = camera.size[0].tolist()
-    offsets = torch.from_numpy(hammersley(samples)).to(camera.pose) - 0.5
-    rays = camera.rays((camera.pixels()[:, None] + offsets).reshape(-1, 2))
-    origins, directions, radius = _arrays(rays)
-    fog = world.fog
+    rays, fog = _stratified(camera, camera.pixels(), samples), world.fog
     numbers = np.array([fog.scattering, fog.scattering + fog.absorption, fog.anisotropy, fog.reach])
-    seen = np.empty((len(rays), 3))
+    seen = np.empty((len(rays[0]), 3))
 
-    def work(first: int) -> None:
-        part = slice(first, first + RAYS_PER_TASK)
-        given = origins[part], directions[part], radius[part] / samples**0.5
-        scattering.light(world.arrays, numbers, *given, first, along, seen[part])
+    def work(part: slice) -> None:
+        scattering.light(world.arrays, numbers, *(x[part] for x in rays), part.start, along, seen[part])
 
-    list(_workers().map(work, range(0, len(rays), RAYS_PER_TASK)))
+    _share_out(work, len(seen))
     return seen.reshape(height, width, samples, 3).mean(2).astype(np.float32)
 
 
@@ -145,12 +136,11 @@ def unoccluded(
     """Mask of the unoccluded directions above each surface point."""
     out = np.empty((len(points), len(directions)), bool)
 
-    def work(first: int) -> None:
-        part = slice(first, first + POINTS_PER_TASK)
+    def work(part: slice) -> None:
         given = (np.ascontiguousarray(x, np.float64) for x in (points[part], normals[part], directions))
         environment.unoccluded(world.arrays, *given, out[part])
 
-    list(_workers().map(work, range(0, len(points), POINTS_PER_TASK)))
+    _share_out(work, len(points), POINTS_PER_TASK)
     return out
 
 
@@ -186,12 +176,11 @@ def trace(world: World, rays: Rays, shaded: bool = True) -> RayHits:
     origins, directions, radius = _arrays(rays)
     seen = RayHits(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
 
-    def work(first: int) -> None:
-        part = slice(first, first + RAYS_PER_TASK)
+    def work(part: slice) -> None:
         out = (x[part] for x in seen)
-        tracer.trace(world.arrays, origins[part], directions[part], radius[part], first, int(shaded), *out)
+        tracer.trace(world.arrays, origins[part], directions[part], radius[part], part.start, int(shaded), *out)
 
-    list(_workers().map(work, range(0, n, RAYS_PER_TASK)))
+    _share_out(work, n)
     return seen
 
 
@@ -203,11 +192,10 @@ def signed_distance(world: World, points: Float[Tensor, "point 3"]) -> Float[Ten
     out = np.empty(len(points))
     points_in = points.detach().double().contiguous().numpy()
 
-    def work(first: int) -> None:
-        part = slice(first, first + RAYS_PER_TASK)
+    def work(part: slice) -> None:
         tracer.signed_distance(world.arrays, points_in[part], out[part])
 
-    list(_workers().map(work, range(0, len(out), RAYS_PER_TASK)))
+    _share_out(work, len(out))
     return torch.from_numpy(out).to(points.dtype)
 
 
@@ -216,19 +204,26 @@ def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: in
 
     aims: shadow rays that each of them sends to each light
     """
-    offsets = torch.from_numpy(hammersley(samples)).to(places) - 0.5
-    rays = camera.rays((places[:, None] + offsets).reshape(-1, 2))
-    origins, directions, radius = _arrays(rays)
-    pixels = np.empty((len(places), 5))
-    step = -(-RAYS_PER_TASK // samples)
+    rays, pixels = _stratified(camera, places, samples), np.empty((len(places), 5))
 
-    def work(first: int) -> None:
-        part, some = slice(first, first + step), slice(first * samples, (first + step) * samples)
-        width = radius[some] / samples**0.5
-        tracer.gather(world.arrays, origins[some], directions[some], width, first, aims, samples, pixels[part])
+    def work(part: slice) -> None:
+        some = (x[part.start * samples : part.stop * samples] for x in rays)
+        tracer.gather(world.arrays, *some, part.start, aims, samples, pixels[part])
 
-    list(_workers().map(work, range(0, len(places), step)))
+    _share_out(work, len(places), -(-RAYS_PER_TASK // samples))
     return pixels
+
+
+def _stratified(camera: Camera, places: Tensor, samples: int) -> tuple[np.ndarray, ...]:
+    """Origins, directions and radius of `samples` rays around each pixel position, as input of the tracer."""
+    offsets = torch.from_numpy(hammersley(samples)).to(places) - 0.5
+    origins, directions, radius = _arrays(camera.rays((places[:, None] + offsets).reshape(-1, 2)))
+    return origins, directions, radius / samples**0.5
+
+
+def _share_out(work: Callable[[slice], None], count: int, step: int = RAYS_PER_TASK) -> None:
+    """Call work(part) for each run of `step` out of `count` items, on all cores."""
+    list(_workers().map(lambda first: work(slice(first, first + step)), range(0, count, step)))
 
 
 def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:

@@ -7,8 +7,6 @@ E is the irradiance of a lamp at a distance r on a surface facing it, V its visi
 angles around each lamp (Kulla and Fajardo 2012), where its 1 / r^2 is constant. Surfaces are matt.
 """
 
-from __future__ import annotations
-
 import math
 
 from numba import njit

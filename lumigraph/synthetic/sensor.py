@@ -5,8 +5,6 @@ its green pixels, by second differences over squares of 8 pixels, is 8 + 0.29 ti
 transfer): the gain is 0.29 DN per photon, and the read noise 2.8 DN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Each shape is centred at its own origin; an Object's pose places it in the world
 A rounded edge is a smaller sharp core, dilated: `rounding` preserves the outer size.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 The tree over plates is built once, and its boxes are refitted to every further pose.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 

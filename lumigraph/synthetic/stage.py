@@ -1,7 +1,5 @@
 """Stage: a world with cameras; and options in its name: "still-life,size=400,seed=1"."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property

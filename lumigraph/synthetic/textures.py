@@ -5,8 +5,6 @@ as the pixel's footprint, and finer noise fades to its mean, so that distant pav
 specified as sRGB and computed with as linear reflectances.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import astuple, dataclass
 from typing import ClassVar

@@ -5,8 +5,6 @@ Light: direct light of lamps and sun on diffuse (Lambert) and specular surfaces 
 glossy surfaces.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Vectors of three as tuples, for compiled code: they live in registers."""
 
-from __future__ import annotations
-
 import math
 
 from numba import njit

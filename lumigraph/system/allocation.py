@@ -5,8 +5,6 @@ returns it at once, and the system zeroes each page again: a third of the proces
 freed memory is kept, up to a limit, for the next step.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

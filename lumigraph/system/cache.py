@@ -1,7 +1,5 @@
 """Cache folder of a user."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import shutil

@@ -4,8 +4,6 @@ Python puts its working directory first on the import path, and Numba reads a co
 works in a folder that another user may have made. Its task is a Request, in which text stays data.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import json

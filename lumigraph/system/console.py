@@ -3,8 +3,6 @@
 So a folder may be called `[/bold]`, `:smile:` or `{0}`, and is printed by that name.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

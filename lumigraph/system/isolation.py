@@ -1,7 +1,5 @@
 """Isolation from the working directory, which another user may have made."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,7 +1,5 @@
 """Memory: peak use of this process, free memory, and the budget of images."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import re
@@ -21,12 +19,7 @@ IMAGES_SHARE = 0.4  # of the memory that this process may take at most; the rest
 FREE_IMAGES_SHARE = 0.6  # of the memory that is free, which images may take
 MAX_THREADS = 16  # more need more memory than they save time
 BYTES_PER_PIXEL = 128  # while a picture is rendered: ray, colour, depth and opacity, in parts and in total
-MEMORY_FAULTS = (
-    "can't allocate memory",
-    "bad_alloc",
-    "Storage size calculation overflowed",
-    "Cannot allocate memory",
-)
+MEMORY_FAULTS = ("can't allocate memory", "bad_alloc", "Storage size calculation overflowed", "Cannot allocate memory")
 UNITS = {unit: 1024**power for power, unit in enumerate("bKMGTPE")}
 CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 GROUP_FILES = {  # limit of a control group, its use, and the use that the system takes back: cached files

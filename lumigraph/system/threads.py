@@ -7,8 +7,6 @@ shorter spin at all times costs too much: of a step of splatting with small phot
 quarter at 40 000.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

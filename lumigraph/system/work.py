@@ -1,7 +1,5 @@
 """Work: context of training, rendering, evaluation and exports, from Python as from the command line."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Address: the host and port that the viewer listens at."""
 
-from __future__ import annotations
-
 import ipaddress
 import secrets
 import socket

@@ -1,8 +1,6 @@
 """ViewRequest: all settings of one picture for one client; conversions of browser cameras and their angles of view;
 Flight: animation of a client's camera by the server."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tab `View` of one client: Controls for settings of the view, MethodControls for controls of the method."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Tab `Crop` of a client: crop of the scene, floater removal, and saving the rest."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import threading

@@ -1,7 +1,5 @@
 """Tab `Export` of a client: the visible scene in the formats of `lumigraph export`."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable
 from typing import Any

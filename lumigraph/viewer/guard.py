@@ -11,8 +11,6 @@ viser sets every attribute that a message names and prints a traceback for unusa
 it.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import math

@@ -1,7 +1,5 @@
 """Modes: pictures of a rendering's colour, depth, opacity or normals, or of one of its extras, such as labels."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor

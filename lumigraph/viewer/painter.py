@@ -1,8 +1,6 @@
 """Painter: rendering thread of one client, coarse while its camera moves, finer at rest.
 Pace: picture size for a given rendering time. MovingPace: the same while the camera moves."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Tab `Path` of a client: keyframes from its camera, playback, saving and loading."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

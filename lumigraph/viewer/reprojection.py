@@ -1,8 +1,6 @@
 """Reprojection: a small picture of a moving camera, with the detail of the last sharp one on common visible surfaces
 (the reverse reprojection cache of Nehab 2007, with a small picture in place of the shader)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Tab `Measure` of a client: distance of two clicked points, and the unit of exports by a known length."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -29,12 +27,7 @@ class RulerPanel:
     """
 
     def __init__(
-        self,
-        client: Any,
-        shared: Shared,
-        locate: Locate,
-        drawn: Callable[[], None],
-        notify: Callable[[str, str], None],
+        self, client: Any, shared: Shared, locate: Locate, drawn: Callable[[], None], notify: Callable[[str, str], None]
     ):
         self._client, self._shared, self._locate, self._drawn, self._notify = client, shared, locate, drawn, notify
         self._points: list[Vector] = []

@@ -1,7 +1,5 @@
 """Scenery: the photographs' cameras and the sparse points, drawn for all clients."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any

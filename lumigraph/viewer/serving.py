@@ -1,7 +1,5 @@
 """viser's server behind a guard that checks connections and messages."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """Subject: the viewer's view of a scene. Shared: state common to all clients."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Tab `Select` of a client: strokes on the view select a part of the scene, which is coloured and saved."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import threading

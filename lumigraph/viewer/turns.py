@@ -1,7 +1,5 @@
 """Turns: mutual exclusion of renderings and training on one method."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

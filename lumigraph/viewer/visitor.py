@@ -1,7 +1,5 @@
 """Visitor: one client of the viewer, with its own camera, controls, path and painter."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os

@@ -36,9 +36,11 @@ class AdaptiveDensity(DensityControl):
     The gradient is the mean length of the loss's gradient in a footprint's centre, in half pictures.
     positional_gradient_sum: of these lengths since the last change
     visible_count:           number of steps since then in which each Gaussian was visible
+    ramp:                    power of the budget's share with which the cap rises
     """
 
     grows: ClassVar[tuple[str, ...]] = ("positional_gradient_sum", "visible_count")
+    ramp: ClassVar[float] = 1.0
     positional_gradient_sum: Tensor
     visible_count: Tensor
 
@@ -62,12 +64,10 @@ class AdaptiveDensity(DensityControl):
 
     @torch.no_grad()
     def finish(self, step: Step) -> None:
-        progress, cloud, picture, number = step.progress, step.learnt, step.picture, step.number
+        progress, cloud, number = step.progress, step.learnt, step.number
         if progress >= self.refining.refine_until:
             return
-        height, width = picture.opacity.shape
-        assert picture.centres.grad is not None
-        self.record(picture.centres.grad, picture.opacities > 0, (width, height))
+        self.note(step)
         steps = number / max(progress, 1e-6)  # of the whole budget
         if step.due:
             cap = self.current_cap(cloud, progress, steps)
@@ -78,12 +78,19 @@ class AdaptiveDensity(DensityControl):
         if number and number % every == 0 and step.full_size and steps - number >= RECOVERY_INTERVALS * every:
             self.reset_opacity(cloud)
 
+    def note(self, step: Step) -> None:
+        """Follow a step, for the next change."""
+        picture = step.picture
+        height, width = picture.opacity.shape
+        assert picture.centres.grad is not None
+        self.record(picture.centres.grad, picture.opacities > 0, (width, height))
+
     def current_cap(self, cloud: Cloud, progress: float, steps: float = 0.0) -> int:
-        """Cap at this share of a budget of `steps` steps: with `cap_ramp` it rises linearly until `refine_until`."""
+        """Cap at this share of a budget of `steps` steps: with `cap_ramp` it rises until `refine_until`."""
         first, cap = int(self.initial_count), self.max_count(cloud, steps)
         if not self.refining.cap_ramp:
             return cap
-        share = min(1.0, progress / self.refining.refine_until)
+        share = min(1.0, progress / self.refining.refine_until) ** self.ramp
         return min(cap, int(first + share * max(cap - first, 0)))
 
     @torch.no_grad()

@@ -58,6 +58,7 @@ class Step:
     differ:     whether photographs have appearances of their own
     full_size:  whether photographs have their final size
     due:        whether density control is due after this step
+    explained:  zeros whose gradient is the error that each Gaussian explains, where density control asks for it
     """
 
     photograph: Photograph
@@ -82,6 +83,7 @@ class Step:
     residual: Float[Tensor, "height width 3"] = field(init=False)
     terms: dict[str, Tensor] = field(default_factory=dict)
     due: bool = False
+    explained: Float[Tensor, " gaussian"] | None = None
 
 
 class Addition(Part):

@@ -32,6 +32,7 @@ from .addition import Addition, Step, TrainingViews
 from .appearance import AppearanceNumbers, SplatAppearance
 from .cloud import Cloud, HasteNumbers, picture_share, thinned
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
+from .error_density import pixel_errors
 from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .moved_cloud import seen_from
@@ -206,7 +207,10 @@ class CloudMethod(Method, ABC):
             part.before_raster(now)
         if self.poses:
             now.cloud, now.camera = seen_from(self.poses, now.cloud, now.camera)
-        now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, TRANSMITTANCE_THRESHOLD)
+        if self.density_control.follows_errors(self.progress):
+            now.explained = torch.zeros(len(now.cloud), device=self.device, requires_grad=True)
+        view = view_of(now.camera, self.near_plane)
+        now.picture = splat(now.cloud, view, self.bands, TRANSMITTANCE_THRESHOLD, numbers=now.explained)
         now.rgb, now.background = now.picture.rgb, self.background[0]
         if now.picture.centres.requires_grad:
             now.picture.centres.retain_grad()  # density control follows it
@@ -224,6 +228,8 @@ class CloudMethod(Method, ABC):
             part.mask(now)
         ssim, l1 = kernels.photometric(now.rgb, now.target)
         now.terms |= {"l1": (1 - self.ssim_weight) * l1, "ssim": self.ssim_weight * (1 - ssim)}
+        if now.explained is not None:  # zero, with the gradient that density control follows
+            now.terms["l1"] = now.terms["l1"] + (now.picture.number * pixel_errors(now)).sum()
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:

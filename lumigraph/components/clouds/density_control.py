@@ -59,6 +59,10 @@ class DensityControl(Addition, ABC):
     def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
         self.initial_count.fill_(len(cloud))
 
+    def follows_errors(self, progress: float) -> bool:
+        """True if a step at this share of the budget is to have `Step.explained`."""
+        return False
+
     def due(self, step: int, progress: float) -> bool:
         """True if the cloud may change after this step; called once a step."""
         ended = self.schedule.due(step, progress)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -109,7 +109,7 @@ class BoneMotion(Part):
     # Corrections
 
     @torch.no_grad()
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         """Smooth the given poses; later smoothings take as long, and as many follow as their share of time allows."""
         warn_of_background(data)
         if not self.numbers.pose_smoothing or data.cameras.time is None:
@@ -124,7 +124,7 @@ class BoneMotion(Part):
         self.smoothings += SMOOTHINGS - int(min(count, SMOOTHINGS))
 
     @torch.no_grad()
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         """Smooth a table's corrections. Those of a network follow smoothly from the given poses."""
         if self.numbers.pose_smoothing and progress * SMOOTHINGS >= self.smoothings + 1:
             self.smoothings += 1

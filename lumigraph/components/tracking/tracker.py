@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ class Tracker(Part):
         self._warned = False
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         if "depth" not in data.layers:
             raise LumigraphError(
                 f"{data.source} has no depth, which maps of depth cameras are made of; train instant-ngp or "

@@ -1,10 +1,6 @@
 """Photographs as bytes, and other values of every pixel: in memory, or, where they are too large, in files."""
 
-from __future__ import annotations
-
-from .cache import cache_folder as cache_folder
 from .cache import in_parallel as in_parallel
-from .layer import ENCODINGS as ENCODINGS
 from .layer import UNKNOWN_INDEX as UNKNOWN_INDEX
 from .layer import Layer as Layer
 from .layer import LayerSource as LayerSource
@@ -12,7 +8,6 @@ from .layer import cosines as cosines
 from .resize import resized as resized
 from .store import ImageSource as ImageSource
 from .store import ImageStore as ImageStore
-from .store import PixelBatch as PixelBatch
 from .store import Runs as Runs
 from .store import runs_of as runs_of
 from .store import shuffled_order as shuffled_order

@@ -1,7 +1,5 @@
 """Cache files: location, names, and atomic creation."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Resizing of pixel values: area averages of light, nearest values of everything else."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

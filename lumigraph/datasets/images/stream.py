@@ -1,7 +1,5 @@
 """ImageStream: photographs that exceed memory and disk, re-read from their sources during training."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections import deque

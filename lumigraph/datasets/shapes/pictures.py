@@ -1,7 +1,5 @@
 """Pictures of shapes: their shaded grey surface for a camera."""
 
-from __future__ import annotations
-
 import torch
 
 from ...camera import Camera

@@ -5,8 +5,6 @@ surface and 0 outside, and in between near holes. Far triangles are summed toget
 expansion (Barill 2018).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Real spherical harmonics of any band, their rotation, and moments of shapes in them by direction and radius.
 Rotations, evenly spread or random."""
 
-from __future__ import annotations
-
 import math
 
 import torch

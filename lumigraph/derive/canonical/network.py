@@ -6,8 +6,6 @@ them for the value in its own direction, which is invariant; a perceptron makes 
 and these weights make the next features. Nothing else meets a coordinate, so all of it is equivariant to rounding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated

@@ -2,4 +2,3 @@
 
 from .compress import compress as compress
 from .model import LADDER as LADDER
-from .model import Rung as Rung

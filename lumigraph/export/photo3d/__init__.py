@@ -5,8 +5,6 @@ Depth maps are made dense, warped into one panorama at their centre, and stitche
 second layer fills disocclusions: seen by other photographs, or extrapolated.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

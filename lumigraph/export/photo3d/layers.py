@@ -1,7 +1,5 @@
 """The second layer behind edges, the texture of both, and their triangles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

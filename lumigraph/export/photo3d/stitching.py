@@ -1,7 +1,5 @@
 """Depth maps in one panorama: made dense, drawn from its middle, and one photograph chosen for each pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Textures of meshes: a UV atlas, colours from photographs or renderings, and normal maps of decimated detail."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colours of texels from pictures whose cameras are known: visibility, the best views, exposure, blending."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

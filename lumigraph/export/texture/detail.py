@@ -1,7 +1,5 @@
 """Normal map: detail lost by decimation, as normals in the tangent frame of the decimated mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree

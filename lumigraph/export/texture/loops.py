@@ -1,7 +1,5 @@
 """Loops over triangles and texels (Numba)."""
 
-from __future__ import annotations
-
 import math
 
 from numba import njit, prange
@@ -17,24 +15,38 @@ def span(a, b, c, size):
     return max(0, math.ceil(low - 0.5)), min(size - 1, math.floor(high - 0.5))
 
 
+@njit(inline="always")
+def placed(corners, f, height, width):
+    """Coordinates and twice the signed area of triangle f, and the rows and columns of pixels that it may cover."""
+    ax, ay, bx, by, cx, cy = corners[f].ravel()
+    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    if not abs(area) > 0:
+        return (ax, ay, bx, by, cx, cy, area), range(0), range(0)
+    left, right = span(ax, bx, cx, width)
+    top, bottom = span(ay, by, cy, height)
+    return (ax, ay, bx, by, cx, cy, area), range(top, bottom + 1), range(left, right + 1)
+
+
+@njit(inline="always")
+def covers(triangle, row, column):
+    """True if a triangle covers a pixel's centre."""
+    ax, ay, bx, by, cx, cy, area = triangle
+    x, y = column + 0.5, row + 0.5
+    v = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
+    w = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
+    return v >= INSIDE and w >= INSIDE and v + w <= 1 - INSIDE
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def rasterize(corners, face):
     """The first triangle over each pixel's centre. corners: (triangle, 3, 2) in pixels; face: (row, column), -1 at
     first"""
     height, width = face.shape
     for f in range(len(corners)):
-        ax, ay, bx, by, cx, cy = corners[f].ravel()
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if not abs(area) > 0:
-            continue
-        left, right = span(ax, bx, cx, width)
-        top, bottom = span(ay, by, cy, height)
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                x, y = column + 0.5, row + 0.5
-                v = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
-                w = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
-                if face[row, column] < 0 and v >= INSIDE and w >= INSIDE and v + w <= 1 - INSIDE:
+        triangle, rows, columns = placed(corners, f, height, width)
+        for row in rows:
+            for column in columns:
+                if face[row, column] < 0 and covers(triangle, row, column):
                     face[row, column] = f
 
 
@@ -49,18 +61,10 @@ def first_faces(corners, normals, offsets, directions, face, depth):
     """
     height, width = face.shape
     for f in range(len(corners)):
-        ax, ay, bx, by, cx, cy = corners[f].ravel()
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if not abs(area) > 0:
-            continue
-        left, right = span(ax, bx, cx, width)
-        top, bottom = span(ay, by, cy, height)
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                x, y = column + 0.5, row + 0.5
-                v = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / area
-                w = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / area
-                if v >= INSIDE and w >= INSIDE and v + w <= 1 - INSIDE:
+        triangle, rows, columns = placed(corners, f, height, width)
+        for row in rows:
+            for column in columns:
+                if covers(triangle, row, column):
                     d = directions[row, column]
                     t = offsets[f] / (normals[f, 0] * d[0] + normals[f, 1] * d[1] + normals[f, 2] * d[2])
                     if 0 < t < depth[row, column]:

@@ -1,7 +1,5 @@
 """Antialiasing of a mesh's silhouettes: neighbouring pixels blend where an edge passes between their centres."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor

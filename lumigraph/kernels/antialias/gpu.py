@@ -99,20 +99,9 @@ def _follow(f, x, y, dx, dy, going, corners, faces, neighbours):
 
 @triton.jit(do_not_specialize=["N", "width", "height"])
 def _forward(
-    picture,
-    depth,
-    found,
-    corners,
-    faces,
-    neighbours,
-    out,
-    edges,
-    N,
-    width,
-    height,
-    C: tl.constexpr,
-    CHANNELS: tl.constexpr,
-):
+    picture, depth, found, corners, faces, neighbours, out, edges, N, width, height,
+    C: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
     n, pixel, column, row, axis, here = _pairs(N, width, height)
     other = pixel + tl.where(axis == 0, 1, width)
     f = tl.load(found + pixel, mask=here, other=-1).to(tl.int64)
@@ -145,19 +134,9 @@ def _move(d_corners, v, place, g, slope, axis, here):
 
 @triton.jit(do_not_specialize=["N", "width", "height"])
 def _backward(
-    grad,
-    picture,
-    corners,
-    faces,
-    edges,
-    d_picture,
-    d_corners,
-    N,
-    width,
-    height,
-    C: tl.constexpr,
-    CHANNELS: tl.constexpr,
-):
+    grad, picture, corners, faces, edges, d_picture, d_corners, N, width, height,
+    C: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
     n, pixel, column, row, axis, here = _pairs(N, width, height)
     other = pixel + tl.where(axis == 0, 1, width)
     edge = tl.load(edges + n, mask=here, other=-1).to(tl.int64)

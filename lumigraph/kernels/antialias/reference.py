@@ -1,7 +1,5 @@
 """Reference implementation: all pairs of pixels at once."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

@@ -214,21 +214,9 @@ def _steps(origins, directions, enter, leave, index, rows, values, ball, starts,
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _value_gradients(
-    g_totals,
-    g_distance,
-    origins,
-    directions,
-    index,
-    rows,
-    values,
-    ball,
-    starts,
-    steps,
-    transmittances,
-    points,
-    first,
+    g_totals, g_distance, origins, directions, index, rows, values, ball, starts, steps, transmittances, points, first,
     out,
-):
+):  # fmt: skip
     """Gradient of each step's interpolated values: dL/dv = T g; alpha also gets what it occludes.
 
     first: of each step, the lower of the two voxels around it along x, counted from the grid's apron
@@ -290,22 +278,8 @@ def backward(ctx, g_totals, g_distance):
     ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
     steps, transmittances, points, d_v = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
     _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, transmittances)
-    _value_gradients(
-        g_totals.numpy(),
-        g_distance.numpy(),
-        origins,
-        directions,
-        index,
-        rows,
-        values,
-        ball,
-        starts,
-        steps,
-        transmittances,
-        points,
-        first,
-        d_v,
-    )
+    noted = starts, steps, transmittances, points, first
+    _value_gradients(g_totals.numpy(), g_distance.numpy(), origins, directions, index, rows, values, ball, *noted, d_v)
     # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
     order, slabs = slabs_of(first, block * index.shape[0] + 1)
     to_values = torch.zeros(values.shape)

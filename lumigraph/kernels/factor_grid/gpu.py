@@ -84,19 +84,9 @@ def _forward(
 
 @triton.jit(do_not_specialize=["S"])
 def _backward(
-    grad,
-    points,
-    table,
-    d_table,
-    S,
-    nx,
-    ny,
-    nz,
-    VM: tl.constexpr,
-    SUMMED: tl.constexpr,
-    R: tl.constexpr,
-    C: tl.constexpr,
-):
+    grad, points, table, d_table, S, nx, ny, nz,
+    VM: tl.constexpr, SUMMED: tl.constexpr, R: tl.constexpr, C: tl.constexpr,
+):  # fmt: skip
     i, here = indices(S, BLOCK)
     x, fx = _place(points, i, 0, here, nx)
     y, fy = _place(points, i, 1, here, ny)

@@ -58,28 +58,11 @@ def _to_face(x, i, d, inverse, scale, n: tl.constexpr):
 
 @triton.jit(do_not_specialize=["R"])
 def _march(
-    origins,
-    directions,
-    t_nears,
-    t_fars,
-    occupied,
-    density,
-    counts,
-    ray_starts,
-    t_start,
-    t_end,
-    R,
-    step,
-    growth,
-    log_growth,
-    most,
-    CASCADES: tl.constexpr,
-    n: tl.constexpr,
-    SKIP: tl.constexpr,
-    GROWS: tl.constexpr,
-    STOP: tl.constexpr,
+    origins, directions, t_nears, t_fars, occupied, density, counts, ray_starts, t_start, t_end,
+    R, step, growth, log_growth, most,
+    CASCADES: tl.constexpr, n: tl.constexpr, SKIP: tl.constexpr, GROWS: tl.constexpr, STOP: tl.constexpr,
     WRITE: tl.constexpr,
-):
+):  # fmt: skip
     r, here = indices(R, BLOCK)
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)

@@ -62,20 +62,9 @@ def _forward(rays, cells, named, density, harmonics, outputs, R, near, stop, DEP
 
 @triton.jit(do_not_specialize=["R", "near", "stop"])
 def _backward(
-    grads,
-    rays,
-    cells,
-    named,
-    density,
-    harmonics,
-    outputs,
-    found,
-    R,
-    near,
-    stop,
-    DEPTH: tl.constexpr,
-    BASIS: tl.constexpr,
-):
+    grads, rays, cells, named, density, harmonics, outputs, found, R, near, stop,
+    DEPTH: tl.constexpr, BASIS: tl.constexpr,
+):  # fmt: skip
     """Gradients: dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i."""
     origins, directions = rays
     d_rgb, d_distance, d_opacity = grads

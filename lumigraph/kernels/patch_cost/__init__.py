@@ -96,7 +96,16 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(size, its_size, count, pixels, planes, radius, generator):
-    """A smooth picture of varied brightness, and slightly shifted neighbours."""
+    pictures = some_views(size, its_size, count, generator)
+    chosen = torch.randperm(size[0] * size[1], generator=generator)[:pixels]
+    varied = torch.rand(len(chosen), planes, 3, generator=generator)
+    slanted = torch.tensor([0.3, -0.2, -0.2]) + torch.tensor([3.0, 0.4, 0.4]) * varied
+    views = torch.rand(len(chosen), count, generator=generator).argsort(1)
+    return *pictures, chosen, views, slanted, radius, 0.3
+
+
+def some_views(size: tuple[int, int], its_size: tuple[int, int], count: int, generator: torch.Generator):
+    """A smooth picture of varied brightness with its trust, slightly shifted neighbours with theirs, and the warps."""
     (height, width), (its_height, its_width) = size, its_size
 
     def wave(rows, columns, shift, phase):
@@ -116,7 +125,4 @@ def _inputs(size, its_size, count, pixels, planes, radius, generator):
     warps = torch.eye(3, 4).repeat(count, 1, 1) + 0.02 * (uniform(count, 3, 4) - 0.5)
     warps[:, 2, :2] *= 0.1
     warps[:, :, 3] = torch.tensor([-1.0, 0.1, 0.01]) * (1 + uniform(count, 1))
-    chosen = torch.randperm(height * width, generator=generator)[:pixels]
-    slanted = torch.tensor([0.3, -0.2, -0.2]) + torch.tensor([3.0, 0.4, 0.4]) * uniform(len(chosen), planes, 3)
-    views = torch.rand(len(chosen), count, generator=generator).argsort(1)
-    return reference, trust, neighbours, its_trust, warps, chosen, views, slanted, radius, 0.3
+    return reference, trust, neighbours, its_trust, warps

@@ -34,8 +34,7 @@ def _cost(
     warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples
 ):
     """One less the correlation. The loop stores nothing, so that the compiler vectorises it, look-ups included. Arrays
-    are
-    passed whole: reference counting of a view takes as long as the loop.
+    are passed whole: reference counting of a view takes as long as the loop.
 
     n: number of the neighbour; p, m: of the pixel and its plane
     values, weights: the neighbours' W b and W with a border; weights are read only where `masked`
@@ -88,24 +87,9 @@ def _cost(
 
 @njit(parallel=True, cache=True, **FAST)
 def _costs(
-    reference,
-    trust,
-    values,
-    weights,
-    masked,
-    rows,
-    columns,
-    warps,
-    pixels,
-    views,
-    planes,
-    dx,
-    dy,
-    apart,
-    sharpness,
-    samples,
-    out,
-):
+    reference, trust, values, weights, masked, rows, columns, warps, pixels, views, planes, dx, dy, apart, sharpness,
+    samples, out,
+):  # fmt: skip
     width = reference.shape[1]
     for chunk in prange((len(pixels) + CHUNK - 1) // CHUNK):
         a, w, across, down = np.empty((4, len(samples)), np.float32)
@@ -119,26 +103,9 @@ def _costs(
                 for i in range(views.shape[1]):
                     n = views[p, i]
                     out[p, m, i] = _cost(
-                        warps,
-                        n,
-                        planes,
-                        p,
-                        m,
-                        x,
-                        y,
-                        across,
-                        down,
-                        a,
-                        w,
-                        whole,
-                        shift,
-                        values,
-                        weights,
-                        rows,
-                        columns,
-                        masked,
-                        samples,
-                    )
+                        warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows,
+                        columns, masked, samples,
+                    )  # fmt: skip
 
 
 def run(reference, trust, neighbours, neighbour_trust, warps, pixels, views, planes, window, deviation):

@@ -19,7 +19,7 @@ def _pixel(picture, row, column, rows, columns, here):
 
 
 @triton.jit
-def _between(picture, row, column, down, right, rows, columns, here):
+def between(picture, row, column, down, right, rows, columns, here):
     """Bilinear interpolation between four pixels, zero outside."""
     above = (1 - right) * _pixel(picture, row, column, rows, columns, here)
     above += right * _pixel(picture, row, column + 1, rows, columns, here)
@@ -80,8 +80,8 @@ def _costs(
         v = tl.minimum(tl.maximum(v, -1.0), rows.to(tl.float32))
         left, top = tl.floor(u), tl.floor(v)
         c, r = left.to(tl.int32), top.to(tl.int32)
-        seen = _between(weights, r, c, v - top, u - left, rows, columns, inside & before)
-        its = _between(weighted, r, c, v - top, u - left, rows, columns, inside & before) - centre * seen  # W (b - a0)
+        seen = between(weights, r, c, v - top, u - left, rows, columns, inside & before)
+        its = between(weighted, r, c, v - top, u - left, rows, columns, inside & before) - centre * seen  # W (b - a0)
         ones += w * seen
         sum_a += w * seen * a
         sum_b += w * its

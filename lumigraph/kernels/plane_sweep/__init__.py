@@ -5,11 +5,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._operation import Facts, door, implementation, require
+from ..patch_cost import BEHIND_DEPTH as BEHIND_DEPTH
+from ..patch_cost import some_views
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(), typical=2, compiled=2)
 
 MIN_VARIANCE = 1e-4  # of values in [0, 1]: a hundredth, squared; windows with less are flat and agree with nothing
-BEHIND_DEPTH = 1e-6  # third coordinate up to which a place is behind the neighbour
 
 
 @door
@@ -89,24 +90,5 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(size, its_size, count, planes, window, best, generator):
-    """A smooth picture of varied brightness, and slightly shifted neighbours."""
-    (height, width), (its_height, its_width) = size, its_size
-
-    def wave(rows, columns, shift, phase):
-        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-        return 0.5 + 0.2 * (0.9 * (x + shift) + 0.4 * y + phase).sin() + 0.2 * (0.3 * x - 0.7 * y - phase).cos()
-
-    def uniform(*shape):
-        return torch.rand(shape, generator=generator)
-
-    phase = 6 * uniform(1)
-    reference = wave(height, width, 0.0, phase)
-    neighbours = torch.stack([wave(its_height, its_width, 1.0 + k, phase + 0.2 * k) for k in range(count)])
-    trust = (1.3 * uniform(height, width)).clamp(max=1)
-    its_trust = (1.3 * uniform(count, its_height, its_width)).clamp(max=1)
-    trust[: height // 3, : width // 3] = 0
-    its_trust[:, -1:, : its_width // 2] = 0
-    warps = torch.eye(3, 4).repeat(count, 1, 1) + 0.02 * (uniform(count, 3, 4) - 0.5)
-    warps[:, 2, :2] *= 0.1
-    warps[:, :, 3] = torch.tensor([-1.0, 0.1, 0.01]) * (1 + uniform(count, 1))
-    return reference, trust, neighbours, its_trust, warps, 0.3 + 3 * uniform(planes), window, best
+    pictures = some_views(size, its_size, count, generator)
+    return *pictures, 0.3 + 3 * torch.rand(planes, generator=generator), window, best

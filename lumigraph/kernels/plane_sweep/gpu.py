@@ -5,44 +5,18 @@ import triton.language as tl
 
 from .._gpu import blocks, launch
 from .._operation import empty
+from ..patch_cost.gpu import between
 from . import BEHIND_DEPTH, MIN_VARIANCE
 
 E, MIN_DEPTH = tl.constexpr(MIN_VARIANCE), tl.constexpr(BEHIND_DEPTH)
 BLOCK = tl.constexpr(128)
 
 
-@triton.jit
-def _pixel(picture, row, column, rows, columns, here):
-    there = here & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    return tl.load(picture + row * columns + column, mask=there, other=0.0)
-
-
-@triton.jit
-def _between(picture, row, column, down, right, rows, columns, here):
-    """Bilinear interpolation between four pixels, zero outside."""
-    above = (1 - right) * _pixel(picture, row, column, rows, columns, here)
-    above += right * _pixel(picture, row, column + 1, rows, columns, here)
-    below = (1 - right) * _pixel(picture, row + 1, column, rows, columns, here)
-    below += right * _pixel(picture, row + 1, column + 1, rows, columns, here)
-    return (1 - down) * above + down * below
-
-
 @triton.jit(do_not_specialize=["height", "width", "rows", "columns", "planes"])
 def _costs(
-    picture,
-    trust,
-    weights,
-    weighted,
-    warps,
-    hypotheses,
-    out,
-    height,
-    width,
-    rows,
-    columns,
-    planes,
+    picture, trust, weights, weighted, warps, hypotheses, out, height, width, rows, columns, planes,
     WINDOW: tl.constexpr,
-):
+):  # fmt: skip
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane, neighbour = tl.program_id(1), tl.program_id(2).to(tl.int64)
     here = pixel < height * width
@@ -72,8 +46,8 @@ def _costs(
         column, row = tl.floor(u), tl.floor(v)
         right, down = u - column, v - row
         c, r = column.to(tl.int32), row.to(tl.int32)
-        seen = _between(weights, r, c, down, right, rows, columns, inside & before)
-        its = _between(weighted, r, c, down, right, rows, columns, inside & before)  # W b
+        seen = between(weights, r, c, down, right, rows, columns, inside & before)
+        its = between(weighted, r, c, down, right, rows, columns, inside & before)  # W b
         n += t * seen
         sum_a += t * seen * a
         sum_b += t * its

@@ -1,7 +1,5 @@
 """Rasterising triangles: attributes and depth of the nearest triangle at each pixel's centre."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull

@@ -132,19 +132,9 @@ def _pull(d_corners, n, share, pull, far, seen):
 
 @triton.jit(do_not_specialize=["P", "width"])
 def _backward(
-    to_values,
-    to_depth,
-    corners,
-    attributes,
-    faces,
-    found,
-    d_corners,
-    d_attributes,
-    P,
-    width,
-    C: tl.constexpr,
-    CHANNELS: tl.constexpr,
-):
+    to_values, to_depth, corners, attributes, faces, found, d_corners, d_attributes, P, width,
+    C: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
     p, _, seen, f, x, y = _pixel(found, P, width)
     n, a, b, c = _corners(corners, faces, f, seen)
     first, second, third, _ = _planes(a, b, c)

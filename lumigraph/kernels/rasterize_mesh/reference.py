@@ -1,7 +1,5 @@
 """Reference implementation: every triangle against every pixel, (F, 3, P)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

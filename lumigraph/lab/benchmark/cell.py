@@ -34,6 +34,7 @@ MEASURED = (
     "compile_seconds",
     "peak_memory",
     "seconds_per_view",
+    "cloud",
     "protocol",
     "trained_on",
     "evaluated_on",

@@ -1,8 +1,6 @@
 """Train and evaluate the cells of a benchmark, each in a separate process, so that memory and faults are isolated;
 update the table and charts after each."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -6,8 +6,6 @@ OUTPUT/
 └── runs/, results.json, results.md    as of every benchmark
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -80,8 +78,7 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
             options=("--blocks", "1"),
         ),
         "rawnerf": Showpiece(
-            "procedural:night,size=100,views=30",
-            "Linear light from noisy mosaics; exposure is chosen later.",
+            "procedural:night,size=100,views=30", "Linear light from noisy mosaics; exposure is chosen later."
         ),
         "regnerf": Showpiece(
             OBJECT,
@@ -152,9 +149,7 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
     },
     "Objects and light": {
         "neural-scene-graph": Showpiece(
-            "procedural:traffic,size=120,views=60",
-            "Cars in boxes, with codes.",
-            "26 dB, KITTI (Ost 2021)",
+            "procedural:traffic,size=120,views=60", "Cars in boxes, with codes.", "26 dB, KITTI (Ost 2021)"
         ),
         "object-nerf": Showpiece(OBJECT, "A branch for the scene, a branch with a code for each object."),
         "nerfactor": Showpiece(
@@ -163,9 +158,7 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
     },
     "Across scenes": {
         "pixelnerf": Showpiece(
-            TOYS,
-            "Features of photographs at points of a field.",
-            "19.33 dB, DTU, three photographs (Yu 2021)",
+            TOYS, "Features of photographs at points of a field.", "19.33 dB, DTU, three photographs (Yu 2021)"
         ),
         "srn": Showpiece(CHAIRS, "A hypernetwork and a learnt ray marcher."),
         "hyp-nerf": Showpiece(TOYS, "A hypernetwork makes the hash table of an object."),
@@ -187,11 +180,7 @@ SHOWPIECES = {name: piece for section in SECTIONS.values() for name, piece in se
 
 
 def gallery(
-    names: Sequence[str],
-    seconds: float,
-    output: Path,
-    tell: Callable[[str], object] = print,
-    launch: Launch = launch,
+    names: Sequence[str], seconds: float, output: Path, tell: Callable[[str], object] = print, launch: Launch = launch
 ) -> int:
     """Train and evaluate methods, and write the page. Finished ones are kept. Returns the signal's exit code if one
     stopped it, otherwise 0.

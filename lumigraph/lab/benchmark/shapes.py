@@ -3,8 +3,6 @@
 OUTPUT/shapes.json has all figures, OUTPUT/shapes.md the same as tables.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence

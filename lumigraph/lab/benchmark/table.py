@@ -1,7 +1,5 @@
 """A benchmark as Markdown and curves: a table that averages seeds, one with a row for each cell, scores over time."""
 
-from __future__ import annotations
-
 import re
 import statistics
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Pre-, in- and post-activation of a voxel grid on a sharp edge (Sun 2022, section 4.1)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

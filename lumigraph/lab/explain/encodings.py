@@ -1,7 +1,5 @@
 """Encodings of a picture's pixels with one network, and a range of scales (Tancik 2020, section 6)."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and their explanation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

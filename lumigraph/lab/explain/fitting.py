@@ -1,7 +1,5 @@
 """Mesh fitting by gradients: from a sphere to its target, with plain and with preconditioned steps (Nicolet 2021)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

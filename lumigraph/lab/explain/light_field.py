@@ -1,7 +1,5 @@
 """Sampling of light fields (Chai et al. 2000): epipolar-plane images, and cameras needed against layers of depth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Figure of one ray: samples, density, transmittance, weights and the accumulated colour, over distance."""
 
-from __future__ import annotations
-
 import base64
 import math
 from html import escape

@@ -6,8 +6,6 @@ phase function has the magnitude g^l, of which harmonics up to degree n keep the
 is baked into c.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

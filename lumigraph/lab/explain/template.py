@@ -1,7 +1,5 @@
 """Conversion of a trained field into other structures with further training, compared with training from scratch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

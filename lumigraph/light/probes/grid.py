@@ -1,7 +1,5 @@
 """ProbeGrid: light probes on a grid, interpolated with visibility (Greger 1998; Majercik 2019, DDGI)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

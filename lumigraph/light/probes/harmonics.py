@@ -1,7 +1,5 @@
 """Spherical harmonics of radiance, and of irradiance (Ramamoorthi 2001)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Octahedral maps (Cigolle 2014): the sphere on a square, with a border for interpolation across its edges."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

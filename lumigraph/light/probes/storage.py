@@ -1,7 +1,5 @@
 """Probes as files: FOLDER/probes.json, radiance.png and distance.png. `docs/probes.md` gives every byte."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

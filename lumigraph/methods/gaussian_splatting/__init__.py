@@ -9,14 +9,16 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity
 from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
+from ...components.clouds.error_density import ErrorDensity
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
-from ...files.ranges import Seed, changed
+from ...files.ranges import changed
 from ...gaussians.splatting import render
+from ...method import BaseConfig
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
 from .instances import Identities, InstanceNumbers
@@ -34,12 +36,12 @@ POSE_LEARNING_RATE = 5e-3  # radians that a step moves a picture at most
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     cloud: CloudNumbers = CloudNumbers()
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
-    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
+    strategy: Literal["adaptive", "error", "mcmc"] = "adaptive"  # density control: section 5, by error, or MCMC
     mcmc: McmcNumbers = McmcNumbers()
     filters: MipNumbers = MipNumbers()
     poses: PoseNumbers = PoseNumbers()
@@ -48,12 +50,13 @@ class Config:
     sparse: FewViewNumbers = FewViewNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     groups: InstanceNumbers = InstanceNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.strategy == "mcmc" and not self.cloud.refine.max_gaussians:
-            raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
+        refine = self.cloud.refine
+        capped = refine.max_gaussians or (self.strategy == "error" and refine.gaussians_per_step)
+        if self.strategy != "adaptive" and not capped:
+            raise LumigraphError(f"With --strategy {self.strategy} a cloud grows up to its cap; give --max-gaussians")
 
 
 class GaussianSplatting(CloudMethod):
@@ -66,11 +69,11 @@ class GaussianSplatting(CloudMethod):
         super().__init__(frame, c)
         self.cloud.antialiased, count = c.filters.antialiased, len(self.cloud)
         self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
-        self.density_control = (
-            MarkovChain(c.cloud.refine, c.mcmc)
-            if c.strategy == "mcmc"
-            else AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, count)
-        )
+        if c.strategy == "mcmc":
+            self.density_control = MarkovChain(c.cloud.refine, c.mcmc)
+        else:
+            kind = ErrorDensity if c.strategy == "error" else AdaptiveDensity
+            self.density_control = kind(c.cloud.refine, c.cloud.adaptive, count)
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
         self.tidying = Tidying(c.tidying)
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
@@ -91,11 +94,12 @@ class GaussianSplatting(CloudMethod):
         """A smaller cloud that begins dense: it learns more in the time."""
         return changed(Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
             half_resolution_until=0.7, max_gaussians=500_000, gaussians_per_step=15.0, cap_ramp=True,
-            densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto")  # fmt: skip
+            strategy="error", refine_until=0.75, densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0,
+            few_views="auto")  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
         return changed(Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
-            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, refine_cameras=True,
+            strategy="error", refine_until=0.8, opacity_reset_interval=5, refine_cameras=True,
             appearance="no")  # fmt: skip

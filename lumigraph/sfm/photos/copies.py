@@ -1,7 +1,5 @@
 """Copies of photographs in a common format: developed raw files, rotated upright, or converted from rare formats."""
 
-from __future__ import annotations
-
 import os
 import statistics
 from collections.abc import Mapping

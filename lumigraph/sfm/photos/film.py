@@ -1,7 +1,5 @@
 """Films as they say that they are to be shown: upright, with square pixels, whole frames, in sRGB."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

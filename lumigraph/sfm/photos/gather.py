@@ -21,7 +21,7 @@ from ...files.names import counted, natural
 from ...files.reading import reason_of
 from ...readers.exif import read_facts
 from ...readers.masks import LABELS, MASKS, OBJECT_MASKS, OTHER_MASKS, PLANES, find_mask, names_beside
-from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
+from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, UNSEEN, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
@@ -175,25 +175,31 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 
 
 def walk(
-    folder: Path, work: Path | None = None, list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir
+    folder: Path,
+    work: Path | None = None,
+    list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir,
+    seen: set[Path] | None = None,
 ) -> Iterator[Path]:
-    """Photographs below a folder, sorted, without hidden ones, masks, and programs' reduced or rendered copies.
+    """Photographs below a folder, sorted, without hidden ones, masks, and programs' reduced or rendered copies. Links
+    to folders are followed, and no folder is entered twice.
 
-    work: a folder to leave out; list_entries: lists the entries of a folder
+    work: a folder to leave out; list_entries: lists the entries of a folder; seen: folders entered so far
     """
+    seen = {folder.resolve()} if seen is None else seen
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
     masks = {name for entry in entries for name in names_beside(entry.stem)}
     for entry in entries:
-        if entry.name.startswith(".") or (work is not None and entry.resolve() == work):
+        if entry.name.lower().startswith(UNSEEN) or (work is not None and entry.resolve() == work):
             continue
         if entry.name in folders:
             reduced = REDUCED_FOLDER.fullmatch(entry.name)
             if entry.name.lower() in NO_PHOTOGRAPHS or (reduced and reduced[1] in folders):
                 continue
-            if not entry.is_symlink() and not any(exists(entry / name) for name in PROGRAM_FILES):
-                yield from walk(entry, work, list_entries)
+            if (place := entry.resolve()) not in seen and not any(exists(entry / name) for name in PROGRAM_FILES):
+                seen.add(place)
+                yield from walk(entry, work, list_entries, seen)
         elif (entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry)) and entry.stem not in masks:
             yield entry
 

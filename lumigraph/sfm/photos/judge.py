@@ -13,8 +13,6 @@ cancel. Motion blurs along its own direction only, hence the minimum. Related to
 Effect", which compares slopes before and after blurring.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ feature if each is the other's nearest in descriptor space, and at RATIO of the 
 Chance alone gives up to 11 on a carpet's repeated pattern; neighbours of a walk around it share 20 to 170.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Pictures without known poses, and the progress interface of long work on them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

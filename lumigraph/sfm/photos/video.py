@@ -7,8 +7,6 @@ clock, for movement that is not measured. The sharpest frame of each segment, wi
 written in the second pass, unless it repeats an earlier one.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator, Sequence

@@ -2,8 +2,6 @@
 file each, found by its name, with `objects(random)` and the common `BOUNDS`. The rotation of the first object is the
 deviation from the category's common orientation."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from dataclasses import replace

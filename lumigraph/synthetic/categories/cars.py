@@ -1,7 +1,5 @@
 """Cars: a body, a cabin with windows, four wheels, lamps; some are vans, some carry a bed behind the cabin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

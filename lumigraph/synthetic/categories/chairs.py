@@ -1,7 +1,5 @@
 """Chairs: a seat on legs or a column, a back of board, slats or rods, sometimes arms."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parts of several categories: random colours and materials."""
 
-from __future__ import annotations
-
 import colorsys
 
 import numpy as np

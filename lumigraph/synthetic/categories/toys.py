@@ -1,7 +1,5 @@
 """Stacking figures: a foot, rings or drums on a rod, arms, a head that looks one way, and a hat."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scenes that come with the package: one file or folder each, found by its name."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from types import ModuleType

@@ -3,8 +3,6 @@
 `width` is the world's width in blocks. Opened by its name it is a `BlockWorld`, with the label of every block.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

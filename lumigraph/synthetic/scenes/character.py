@@ -1,7 +1,5 @@
 """A skinned character of a glTF file, "character,file=PATH,clip=1", which plays an animation from time 0 to time 1."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -3,8 +3,6 @@
 The wheels turn by their gear ratio, and the pendulum swings. `World.carried` gives the path of any surface point.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

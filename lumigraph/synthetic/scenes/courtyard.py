@@ -1,7 +1,5 @@
 """A southern courtyard: an unbounded scene seen from inside. A unit is some four metres; z = 0 is at eye height."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..cameras import pinhole, stroll, walk

@@ -4,8 +4,6 @@
 the extinction in hundredths per scene unit. Nothing else lights the scene.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """A hand that grasps a can and lets it go, from time 0 to time 1: 16 bones of the hand and one of the can."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +8,11 @@ import numpy as np
 import torch
 
 from ...datasets.skeleton import ROOT, BonePose, Skeleton, posed
-from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, photographed
+from ..characters import CharacterOptions, Joints, SolidCharacter, moved_shapes, photographed, turned_along
 from ..shapes import Cuboid, Cylinder, SoftCapsule, SolidShape
 from ..stage import SyntheticStage
 from ..textures import Mottle, Plain, Sectors, Texture
-from ..world import Material, Object, Pose, World, nested, rotation_about
+from ..world import Pose, World, rotation_about
 
 Options = CharacterOptions
 SKIN, BLUSH, NAIL = (0.86, 0.64, 0.52), (0.74, 0.46, 0.38), (0.95, 0.78, 0.74)
@@ -57,7 +55,7 @@ def direction(finger: str) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Grasp:
+class Grasp(SolidCharacter):
     """Hand and can, a `characters.Character`."""
 
     @property
@@ -92,9 +90,7 @@ class Grasp:
         yield "wrist", Cuboid(PALM, 0.065), skin, Pose.at(0, REST_AWAY, 0)
         for finger, (_, lengths, radius) in FINGERS.items():
             along = direction(finger)
-            side = np.cross([0.0, 1.0, 0.0], along)
-            side /= np.linalg.norm(side)
-            turn = nested(np.stack([side, np.cross(along, side), along], 1))
+            turn = turned_along(along)
             for number, length in enumerate(lengths):
                 name = f"{finger} {number + 1}"
                 middle = joints[names.index(name), :, 3] + 0.5 * length * along
@@ -105,17 +101,7 @@ class Grasp:
     def world(self, pose: Joints) -> World:
         """Hand and can in a pose, with light."""
         names, _, home = bones()
-        shift = pose[:, :, 3] - (pose[:, :, :3] @ home[:, :, 3:])[:, :, 0]
-        moves = {name: Pose(tuple(shift[i].tolist()), nested(pose[i, :, :3])) for i, name in enumerate(names)}
-        objects = tuple(
-            Object(shape, Material(texture, gloss=0.3, roughness=0.4), moves[name] @ place, name)
-            for name, shape, texture, place in self.parts()
-        )
-        return World(objects, (KEY, FILL), SKY)
-
-    def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Bounding box in a pose: lowest and highest corner."""
-        return self.world(pose).bounds()
+        return moved_shapes(self.parts(), names, home, pose, (0.3, 0.4))
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, jitter_bones: int = 0) -> SyntheticStage:

@@ -5,8 +5,6 @@ the mesh at its time, `Scene.about["vertices"]`: a grid (row, column, 3) over di
 the source's frame, from the crown down and once around from the back.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache

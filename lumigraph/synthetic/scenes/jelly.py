@@ -3,8 +3,6 @@
 Its motion is not rigid. `World.carried` gives the path of any surface point.
 """
 
-from __future__ import annotations
-
 import math
 
 from ..filming import Filmed, film

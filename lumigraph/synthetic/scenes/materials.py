@@ -4,8 +4,6 @@
 Light 0 to 4: a studio with two soft boxes, a sun in the morning, a low sun, an overcast sky, a room with a window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any

@@ -1,8 +1,6 @@
 """The study at night: two lamps and the moon through the window, photographed raw by a hand-held camera at three
 shutter times, mostly dark. The noise-free radiance is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A rig for omnidirectional stereo: outward cameras on a level circle, in the study of `room`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

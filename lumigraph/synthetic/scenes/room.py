@@ -3,8 +3,6 @@
 procedural:room,depth,views=300,size=320        a hand-held depth camera once around it; pictures of 320x240, metres
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Toys on a turntable: an object scene with wood, marble, paint and brass, fine rods and soft shadows."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..cameras import dome, pinhole, spiral

@@ -3,8 +3,6 @@
 Every limb is rigid, turns about its joint and touches no other. `World.carried` gives the path of any of its points.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

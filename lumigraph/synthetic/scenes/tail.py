@@ -1,7 +1,5 @@
 """A tail: a chain of 2 to 60 bones in a row that winds from time 0 to time 1; see `characters`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,7 +9,7 @@ import torch
 
 from ...datasets.skeleton import ROOT, BonePose, Skeleton, posed
 from ...files.ranges import between
-from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, photographed
+from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, SolidCharacter, photographed
 from ..shapes import SoftCapsule
 from ..stage import SyntheticStage
 from ..textures import Checker, Mottle, Stripes
@@ -35,7 +33,7 @@ class Options(CharacterOptions):
 
 
 @dataclass(frozen=True)
-class Tail:
+class Tail(SolidCharacter):
     """The tail, a `characters.Character`."""
 
     joints: int
@@ -74,10 +72,6 @@ class Tail:
             for i in range(self.joints)
         )
         return World(objects, (KEY, FILL), SKY)
-
-    def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Bounding box in a pose: lowest and highest corner."""
-        return self.world(pose).bounds()
 
 
 def stage(

@@ -4,8 +4,6 @@ Cars are rigid, and their boxes are known at all times. The held-out photographs
 two training photographs. `with_edits` renders the truth of an edited scene.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -93,13 +91,11 @@ def square() -> tuple[Object, ...]:
     for azimuth, half, height, walls in HOUSES:
         angle = math.radians(azimuth)
         at = Pose.at(1.75 * math.cos(angle), 1.75 * math.sin(angle), GROUND, turn=azimuth - 90.0)
-        roof = Material(Stripes((0.50, 0.30, 0.24), (0.40, 0.24, 0.20), period=0.05))
         parts.append(
             Object(Cuboid((half, 0.25, 0.5 * height)), Material(walls), at @ Pose.at(0, 0, 0.5 * height), "house")
         )
-        parts.append(Object(Cuboid((half + 0.03, 0.29, 0.04)), roof, at @ Pose.at(0, 0, height + 0.04), "house"))
-        door = Material(Plain((0.22, 0.32, 0.30)), gloss=0.4)
-        parts.append(Object(Cuboid((0.09, 0.015, 0.17)), door, at @ Pose.at(0.12, -0.25, 0.17), "house"))
+        parts.append(Object(Cuboid((half + 0.03, 0.29, 0.04)), ROOF, at @ Pose.at(0, 0, height + 0.04), "house"))
+        parts.append(Object(Cuboid((0.09, 0.015, 0.17)), DOOR, at @ Pose.at(0.12, -0.25, 0.17), "house"))
     for azimuth in (75.0, 106.0, 138.0, 44.0):
         x, y = 1.3 * math.cos(math.radians(azimuth)), 1.3 * math.sin(math.radians(azimuth))
         parts.append(Object(Cylinder(0.025, 0.12), STONE, Pose.at(x, y, GROUND + 0.12), "tree"))

@@ -1,7 +1,5 @@
 """A walker: a figure of soft limbs on 16 bones, which walks on the spot from time 0 to time 1; see `characters`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +8,11 @@ import numpy as np
 import torch
 
 from ...datasets.skeleton import ROOT, BonePose, Skeleton, posed
-from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, photographed
+from ..characters import CharacterOptions, Joints, SolidCharacter, moved_shapes, photographed, turned_along
 from ..shapes import Ball, Cuboid, SoftCapsule, SolidShape
 from ..stage import SyntheticStage
 from ..textures import Checker, Mottle, Plain, Stripes, Texture
-from ..world import Material, Object, Pose, World, nested, rotation_about
+from ..world import Pose, World, rotation_about
 
 Options = CharacterOptions
 STRIDES = 5  # walking cycles in a capture
@@ -86,15 +84,8 @@ def limb(start: str, end: str, radius: float, texture: Texture) -> Iterator[tupl
     """A capsule from one joint to the next, moved by the first."""
     a, b = (np.array(JOINTS[name][1]) for name in (start, end))
     along = (b - a) / np.linalg.norm(b - a)
-    side = np.cross([0.0, 1.0, 0.0], along)
-    side /= np.linalg.norm(side)
-    turn = np.stack([side, np.cross(along, side), along], 1)
-    yield (
-        start,
-        SoftCapsule(radius, 0.5 * float(np.linalg.norm(b - a))),
-        texture,
-        Pose(tuple(0.5 * (a + b)), nested(turn)),
-    )
+    shape = SoftCapsule(radius, 0.5 * float(np.linalg.norm(b - a)))
+    yield start, shape, texture, Pose(tuple(0.5 * (a + b)), turned_along(along))
 
 
 def parts() -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
@@ -114,12 +105,8 @@ def parts() -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
         yield from limb(f"{side} upper arm", f"{side} forearm", 0.055, shirt)
         yield from limb(f"{side} forearm", f"{side} hand", 0.042, skin)
         glove = Plain((0.92, 0.74, 0.18)) if side == "left" else Plain((0.20, 0.55, 0.32))
-        yield (
-            f"{side} hand",
-            SoftCapsule(0.045, 0.03),
-            glove,
-            Pose.at(0.535 * x, 0, 0.075) @ Pose.about((0, 1, 0), 135 * x),
-        )
+        palm = Pose.at(0.535 * x, 0, 0.075) @ Pose.about((0, 1, 0), 135 * x)
+        yield f"{side} hand", SoftCapsule(0.045, 0.03), glove, palm
         yield from limb(f"{side} thigh", f"{side} shin", 0.078, cloth)
         yield from limb(f"{side} shin", f"{side} foot", 0.058, cloth)
         shoe = Stripes(SHOE, SOLE, period=0.06)
@@ -127,7 +114,7 @@ def parts() -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
 
 
 @dataclass(frozen=True)
-class Walker:
+class Walker(SolidCharacter):
     """The figure, a `characters.Character`."""
 
     @property
@@ -141,19 +128,7 @@ class Walker:
 
     def world(self, pose: Joints) -> World:
         """The figure in a pose, with light."""
-        home = rest()
-        turn = pose[:, :, :3] @ home[:, :, :3].transpose(0, 2, 1)
-        shift = pose[:, :, 3] - (turn @ home[:, :, 3:])[:, :, 0]
-        moves = {name: Pose(tuple(shift[i].tolist()), nested(turn[i])) for i, name in enumerate(NAMES)}
-        objects = tuple(
-            Object(shape, Material(texture, gloss=0.2, roughness=0.5), moves[name] @ place, name)
-            for name, shape, texture, place in parts()
-        )
-        return World(objects, (KEY, FILL), SKY)
-
-    def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Bounding box in a pose: lowest and highest corner."""
-        return self.world(pose).bounds()
+        return moved_shapes(parts(), NAMES, rest(), pose, (0.2, 0.5))
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, jitter_bones: int = 0) -> SyntheticStage:

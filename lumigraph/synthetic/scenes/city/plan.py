@@ -1,7 +1,5 @@
 """A city's plan: crossings on a grid, streets between neighbours, and a drive along all of them. Lengths in metres."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

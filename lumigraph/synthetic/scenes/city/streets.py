@@ -1,7 +1,5 @@
 """Streets: asphalt and its markings, pavements, houses around, trees, lamps and parked cars. Lengths in metres."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 
