@@ -76,6 +76,21 @@ def test_a_link_that_was_copied_as_text_leads_to_its_folder(tiny, tmp_path):
     assert len(transforms.read(folder).shots) == 6
 
 
+def test_names_in_another_encoding(tiny, tmp_path):
+    folder = write_colmap(tmp_path, tiny, text=True)
+    for path in [*(folder / "images").iterdir()]:
+        path.rename(path.with_name(path.name.replace("view", "v\u00fce")))
+    path = folder / "sparse/0/images.txt"
+    path.write_bytes(path.read_text().replace("view", "v\u00fce").encode("latin-1"))
+    assert len(colmap.read(folder).shots) == 6
+
+
+def test_photographs_beside_the_folder_of_poses(tiny, tmp_path):
+    folder = write_ngp(tmp_path / "nerfstudio", tiny, frames=frames_named(tiny, "{}"))
+    (folder / "images").rename(tmp_path / "resized_images")
+    assert len(transforms.read(folder).shots) == 6
+
+
 def test_names_in_other_letters(tmp_path):
     name = "Stra\u00dfe caf\u00e9 (1).JPG"
     (tmp_path / "images").mkdir()
@@ -260,6 +275,9 @@ def test_a_capture_further_down_and_under_another_name_is_named(tiny, tmp_path):
     write_ngp(tmp_path / "unpacked" / "scene", tiny)
     with pytest.raises(LumigraphError, match=r"no camera poses itself, and .*unpacked/scene does"):
         read_capture(tmp_path)
+    (tmp_path / "cameras.xml").write_text("<document>")
+    with pytest.raises(LumigraphError, match="the poses of Metashape"):
+        read_capture(tmp_path / "cameras.xml")
     place = tmp_path / "unpacked" / "scene" / "transforms.json"
     place.rename(place.with_name("cameras_nerf.json"))
     for path in (place.parent, place.with_name("cameras_nerf.json")):

@@ -4,8 +4,6 @@ Packed by KHR_draco_mesh_compression, EXT_meshopt_compression or KHR_meshopt_com
 decoders are packages of the extra `gltf`.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

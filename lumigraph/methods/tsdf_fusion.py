@@ -22,6 +22,7 @@ from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.ranges import NonNegative, Positive, Share, between
 from ..method import BaseConfig, Descend, RayMethod
+from ..method.depth import DEPTH_DEVIATION, DEPTH_LAYER, DEVIATION_LAYER
 from ..system.memory import free_memory
 
 Length = Annotated[float, between(0, 1e6)]  # of the capture's frame
@@ -115,25 +116,29 @@ class TSDFFusion(RayMethod):
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
         """The next photograph with its depth, in the order of their names."""
         train = data.splits["train"]
-        return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), ("depth",))
+        layers = [name for name in (DEPTH_LAYER, DEVIATION_LAYER) if name in data.layers]
+        return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), layers)
 
     @torch.no_grad()
     def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
         """Fuse one depth map."""
-        self._fuse(
-            DepthMap.measured(batch.camera, batch.extra["depth"], batch.before(self.frame.background)), batch.mask
-        )
+        depth, stated = batch.extra[DEPTH_LAYER], batch.extra.get(DEVIATION_LAYER)
+        sure = None if batch.mask is None else batch.mask.float()
+        if stated is not None:  # inverse variance, beside that of a sure measurement
+            share = (DEPTH_DEVIATION * depth / stated).square().clamp(max=1).nan_to_num(1.0)
+            sure = share if sure is None else share * sure
+        self._fuse(DepthMap.measured(batch.camera, depth, batch.before(self.frame.background)), sure)
         return {}
 
-    def _fuse(self, seen: DepthMap, mask: Tensor | None = None) -> None:
+    def _fuse(self, seen: DepthMap, sure: Tensor | None = None) -> None:
         c = self.config
         farthest = c.max_depth or math.inf
         if c.weighting == "depth":
             trust = release_weight(seen, self.unit, SAMPLE_WEIGHT, SENSOR_SPAN, farthest)
         else:
             trust = trust_of(seen, c.trusted_depth * self.unit, farthest * self.unit)
-        if mask is not None:
-            trust = trust * mask.to(trust)
+        if sure is not None:
+            trust = trust * sure.to(trust)
         if not self.volume.fuse(seen, trust):
             warnings.warn(
                 f"Memory holds no more than {len(self.volume)} blocks, so new surfaces are left out; give a larger "

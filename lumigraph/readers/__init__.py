@@ -11,7 +11,7 @@ from types import ModuleType
 
 from ..errors import LumigraphError
 from ..files import exists
-from ..files.foreign import about_file, about_poses
+from ..files.foreign import about_file, about_poses, is_pose_file
 from ..files.readers import LISTED, NAMES
 from ..files.reading import reads
 from .assemble import Before as Before
@@ -39,7 +39,7 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     if not folder.is_dir():
         raise LumigraphError(
             about_file(folder)
-            or (about_poses(folder.parent) if folder.suffix == ".json" else None)
+            or (about_poses(folder.parent) if is_pose_file(folder) else None)
             or f"{folder} is a file; name the folder that holds the photographs and their poses, "
             f"or find those of a video or of photographs first: lumigraph capture {folder}"
         )

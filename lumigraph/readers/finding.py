@@ -15,7 +15,8 @@ from .pictures import find_file
 
 MAX_LINK_BYTES = 255  # of the text of a link
 NO_LETTERS = re.compile(r"[\W_]+")
-PHOTOGRAPH_FOLDERS = ("images", "input", "image", "rgb", "photos")  # where photographs lie below a scene
+PHOTOGRAPH_FOLDERS = ("images", "input", "image", "rgb", "photos", "../images", "../resized_images")  # from a scene on
+LOST = re.compile("\ufffd+")  # letters of another encoding than UTF-8
 
 
 def find_named(folder: Path, name: str) -> Path:
@@ -23,7 +24,8 @@ def find_named(folder: Path, name: str) -> Path:
 
     Looked for in turn: the name as it is; its end, from the longest on, below the folder and its folders of
     photographs; the same in other letters (upper and lower case, composed and decomposed accents), and with other signs
-    between letters and digits, as programs replace spaces and brackets. Signs of a link (%20) are undone.
+    between letters and digits, as programs replace spaces and brackets; the only one that differs in letters which are
+    no UTF-8. Signs of a link (%20) are undone.
     """
     exact = find_file(folder / name)
     if is_file(exact):
@@ -43,6 +45,10 @@ def find_named(folder: Path, name: str) -> Path:
             for place in places:
                 if (other := in_other_form(place, end, form)) is not None:
                     return other
+    if "\ufffd" in name:
+        form = re.compile(LOST.sub(".+", re.escape(parts[-1])))
+        found = {x.resolve() for place in places for x in place.iterdir() if form.fullmatch(x.name) and is_file(x)}
+        return found.pop() if len(found) == 1 else exact
     return exact
 
 
