@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -23,9 +24,10 @@ from lumigraph.components.skinning.bone_motion import (
     on_splines,
     rotation_vectors,
     smoothed_poses,
+    warn_of_background,
 )
 from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
-from lumigraph.datasets.scene import Scene
+from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.datasets.skeleton import BonePose, rigid_inverse, rigid_product
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange.bones import write_bones
@@ -149,6 +151,22 @@ def test_smooth_poses_begin_a_run_and_are_kept():
     hurried = BoneMotion(replace(frame(), skeleton=moving), BoneNumbers("table", pose_smoothing=True))
     hurried.begin(None, data, 1e-3)  # no time for more
     assert hurried.smoothings == 10
+
+
+@pytest.mark.parametrize(("colour", "alpha", "masked"), [(0.6, False, False), (0.6, True, False), (0.6, False, True)])
+def test_a_background_around_a_body_is_said(colour, alpha, masked):
+    """Opaque pictures with colours up to the edge are; those with alpha or masks are not."""
+    camera = tiny.scene(2).photograph(0).camera
+    width, height = camera.size[0].tolist()
+    picture = torch.full((height, width, 3), colour)
+    mask = torch.zeros(height, width, dtype=torch.bool) if masked else None
+    shot = Photograph(camera, picture, torch.zeros(height, width) if alpha else None, mask)
+    scene = Mock(spec=Scene, splits={"train": torch.arange(3)}, frame=frame(), source="a walk")
+    scene.photograph.return_value = shot
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        warn_of_background(scene)
+    assert [str(x.message)[:34] for x in said] == ["a walk: photographs show a backgro"] * (not alpha and not masked)
 
 
 def test_weights_begin_at_the_nearest_bone_and_sum_to_one():

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.methods.tsdf_fusion import TSDFFusion
 from lumigraph.opening import open_scene, read_capture
 from lumigraph.readers import choose_reader
 
@@ -125,6 +126,49 @@ def test_a_layout_reads_back(reader, write, tmp_path, monkeypatch):
     points = camera.rays(camera.pixels()).at(measured.nan_to_num().flatten())
     along = ((points - camera.position) * camera.forward).sum(-1)[known.flatten()] * scene.frame.to_source.scale
     torch.testing.assert_close(along, torch.full_like(along, 2.0), atol=2e-3, rtol=0)
+
+
+def write_confidence(folder: Path, app: str) -> Path:
+    """A capture of a phone whose confidence is low above, medium in the middle, high below."""
+    levels = np.repeat(np.array([0, 1, 2], np.uint8), 5)[:, None].repeat(20, 1)
+    if app == "record3d":
+        write_record3d(folder)
+        for i in range(3):
+            (folder / "rgbd" / f"{i}.conf").write_bytes(levels.tobytes())
+        return folder
+    write_polycam(folder)
+    (folder / "keyframes" / "confidence").mkdir()
+    for i in range(3):
+        grey = np.array([0, 54, 255], np.uint8)[levels] if app == "polycam" else levels
+        Image.fromarray(grey).save(folder / "keyframes" / "confidence" / f"100{i}.png")
+    return folder
+
+
+@pytest.mark.parametrize("app", ["record3d", "polycam", "arkit"])
+def test_confidence_of_phones_is_a_mask_and_a_deviation(app, tmp_path, monkeypatch):
+    """The lowest is unknown; medium depth deviates three times as much as sure depth, and is fused with a ninth of its
+    weight."""
+    unpacker = SimpleNamespace(decompress=lambda data: data, error=RuntimeError)
+    monkeypatch.setitem(sys.modules, "liblzfse", unpacker)
+    scene = open_scene(write_confidence(tmp_path / "scan", app))
+    photograph = scene.photograph(1, ("depth", "depth_deviation"))
+    measured, deviation = photograph.extra["depth"], photograph.extra["depth_deviation"]
+    assert not measured[:10].isfinite().any() and measured[10:].isfinite().float().mean() > 0.99
+    share = deviation / measured
+    torch.testing.assert_close(share[11:20, 1:], torch.full((9, 39), 0.03), atol=1e-3, rtol=0)
+    torch.testing.assert_close(share[21:, 1:], torch.full((9, 39), 0.01), atol=1e-3, rtol=0)
+    method = TSDFFusion(scene.frame, TSDFFusion.smallest())
+    fused = []
+    monkeypatch.setattr(method, "_fuse", lambda seen, sure: fused.append(sure))
+    method.step(method.batch(scene, torch.Generator()), 0, lambda terms: None)
+    torch.testing.assert_close(fused[0][15, 5] * 9, fused[0][25, 5], atol=1e-3, rtol=0)
+
+
+def test_confidence_of_another_size_is_named(tmp_path):
+    folder = write_confidence(tmp_path / "scan", "polycam")
+    Image.fromarray(np.zeros((5, 5), np.uint8)).save(folder / "keyframes" / "confidence" / "1001.png")
+    with pytest.raises(LumigraphError, match="confidence"):
+        open_scene(folder).photograph(1, ("depth",))
 
 
 def test_what_is_wrong_with_a_layout_is_said(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from lumigraph.camera.rays import Rays, Samples
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Batch
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.dvr import DVR, first_of_each, sum_of_lengths
+from lumigraph.methods.dvr import DVR, NORMAL_WEIGHT, first_of_each, sum_of_lengths
 from lumigraph.methods.dvr.fields import LOGIT_SCALE
 from lumigraph.run import build
 
@@ -123,7 +123,7 @@ def test_smoothness_compares_normals_and_has_a_gradient():
     (gradient,) = torch.autograd.grad(term, method.network.network.weights[-1])
     assert gradient.isfinite().all() and gradient[0].any()
     # neighbours up to 0.05 away along each axis turn the normal by at most that over the radius
-    assert 0 < float(term) < method.config.normal_weight * 0.05 * math.sqrt(3) / RADIUS
+    assert 0 < float(term) < NORMAL_WEIGHT * 0.05 * math.sqrt(3) / RADIUS
 
 
 def test_steps_along_rays_double():

@@ -1,8 +1,8 @@
 """The numbers of `--preset paper`, held as literals, the page's section on where a method differs from its paper, and
 its table of options. `python tests/test_paper_presets.py` writes these tables.
 
-A source is the authors' release, by repository and file, or the paper. "From memory" marks numbers of a paper whose
-text was not at hand, and which no release confirms.
+A source is the authors' release, by repository and file, or the paper. "After the text" marks numbers that no release
+of the authors confirms.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ WORDS: dict[str, Any] = {
 }
 
 PUBLISHED: dict[str, dict[str, Any]] = {
-    "fourier-features": {  # tancik/fourier-feature-networks, Demo.ipynb; the paper's section 6.1. From memory
+    "fourier-features": {  # tancik/fourier-feature-networks, 2d_image_regression.ipynb; the scale of Demo.ipynb
         "encoding": "gaussian",
         "scale": 10.0,
         "frequencies": 256,
@@ -80,7 +80,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "guard_margin": 0.05,  # frustum_bound
         "learning_rate": 1e-3,
     },
-    # google-research/dreamfields, config_base.py and config_hq.py; Poole 2022, section 3, from memory
+    # google-research/dreamfields, config_base.py and config_mq.py; after the text of Poole 2022, section 3
     "dream-fields": WORDS
     | {
         "steps.steps_per_diagonal": 192,  # num_samples, from 4 - sqrt(3) to 4 + sqrt(3)
@@ -98,7 +98,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "rates.scales_lr": 5e-3,
         "rates.quaternions_lr": 5e-3,
     },
-    "imap": {  # sections 3.1 to 3.4. From memory; rates and iterations are not in the paper
+    "imap": {  # after the text of sections 3.1 to 3.4, which has no release; rates and iterations are ours
         "field": "network",
         "layers": 4,
         "hidden_width": 256,
@@ -186,7 +186,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "huber_delta": 1.0,
         "learning_rate": 5e-4,
     },
-    "nerf-w": {  # the paper's supplement; samples also in rover-xingyu/Ha-NeRF, issue 31. The others from memory
+    "nerf-w": {  # the supplement; samples in rover-xingyu/Ha-NeRF, issue 31; codes, weight in kwea123/nerf_pl
         "field": "network",
         "network.depth": 8,
         "network.position_frequencies": 15,
@@ -249,7 +249,8 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "flow.depth_weight": 0.04,
         "flow.prior_interval": 30_000 / 500_000,
     },
-    "neural-volumes": {  # facebookresearch/neuralvolumes, models/; weights, rate and batch are from memory
+    # facebookresearch/neuralvolumes, models/; weights and rate as its experiment's config.py stands in copies of it
+    "neural-volumes": {
         "encoder_cameras": 3,
         "encoder_size": 512,  # of 512 x 334, padded to 512 x 384
         "encoder_width": 64,
@@ -313,7 +314,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "motion.motion_lr": 1.6e-4,
         "motion.final_rate": 0.01,
     },
-    "block-nerf": {  # the paper's appendix, from memory; codes, penalty and width also in hjxwhy/Block-NeRF
+    "block-nerf": {  # after the text of the appendix; codes, penalty and width also in hjxwhy/Block-NeRF
         "field": "network",
         "network.depth": 8,
         "network.position_frequencies": 16,
@@ -597,10 +598,10 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "networks": 2,
         "coarse_loss_weight": 1.0,
         "learning_rate": 1e-4,
-        "members_per_step": 4,  # from memory; 16 where no option says another
+        "members_per_step": 4,  # ours; an early train.py has 16
         "rays_per_member": 128,
     },
-    "mesh-fit": {  # Nicolet 2021; lambda and a sphere from the release's tutorial, from memory
+    "mesh-fit": {  # rgl-epfl/large-steps-pytorch, figures/comparison/generate_data.py; the tutorial has lambda 49
         "start": "sphere",
         "smoothness": 19.0,
         "laplacian_weight": 0.0,
@@ -661,7 +662,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "shapes_per_step": 8,
         "points_per_shape": 16_384,
         "points.pool_points": 500_000,  # section 5
-        "points.near_spread": 0.05,  # the supplement: variances of 0.0025 and 0.00025. From memory
+        "points.near_spread": 0.05,  # src/PreprocessMesh.cpp: variances of 0.0025 and 0.00025
         "points.fine_spread": 0.0158,
         "learning_rate": 5e-4,
         "code_learning_rate": 1e-3,
@@ -670,7 +671,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "features": 32,
         "hidden_width": 128,
         "base_level": 2,  # feature-size 4
-        "levels": 5,  # the paper's table 1. From memory
+        "levels": 5,  # num-lods of sdf-net/README.md
         "points.pool_points": 500_000,  # num-samples 100 000 in each of five modes
         "points.near_share": 0.8,  # sample-mode rand near near trace trace
         "points.fine_spread": 0.0,
@@ -785,12 +786,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "learning_rate": 1e-4,
         "final_learning_rate": 2.5e-5,  # two milestones, a half each
     },
-    "occupancy-network": {  # autonomousvision/occupancy_networks, configs/default.yaml
+    "occupancy-network": {  # autonomousvision/occupancy_networks, configs/default.yaml and pointcloud/onet.yaml
         "code": 512,
         "picture_size": 224,
         "views": 24,
         "shapes_per_step": 64,
-        "cloud_points": 300,  # section 4.3. This and what follows from memory
+        "cloud_points": 300,
         "points_per_shape": 2048,
         "points.near_share": 0.0,
         "encoder_width": 512,

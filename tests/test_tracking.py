@@ -37,7 +37,7 @@ from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.readers.unposed import Unposed
 from lumigraph.readers.unposed import unposed as without_poses
 
-pytestmark = budget("methods", 4)
+pytestmark = budget("methods", 6)
 
 
 def walk(count: int = 20, seed: int = 0) -> np.ndarray:
@@ -274,6 +274,30 @@ def test_a_pose_is_checked_by_the_depth_of_keyframes():
     assert tracker.agrees(frames[2], aside, scene, 0) and tracker.overlap < 0.3  # nothing in common is no fault
     tracker.trajectory.know(1, wrong, 0)  # a drift that the last frame shares
     assert not tracker.agrees(replace(frames[1], index=3), wrong, scene, 1)
+
+
+def test_a_pose_that_slid_along_a_wall_comes_second():
+    """Depth of a wall does not determine the shift along it; colours beside the last frame do."""
+    first, second = steps(2, (0.0, 0.02, 0.0, 0.04, 0.01, 0.0))
+    frames = [in_room(0, first), in_room(1, second)]
+    tracker, scene = tracker_of(frames, first)
+    tracker.trajectory.know(0, first, 0)
+    slid = torch.cat([second[:, :3], second[:, 3:] + 0.06 * second[:, :1]], 1)
+    for poses in ([slid, second], [second, slid]):
+        assert tracker.closest_first(frames[1], poses, scene, 0)[0] is second
+
+
+def test_a_loop_is_found_where_the_path_says_so():
+    """Two keyframes of one place whose thumbnails differ, with eleven of another place between them."""
+    here, beside = steps(2, (0.03, 0.05, 0, 0.05, 0, 0.04))
+    away = steps(2, (0, 2.0, 0, 0, 0, 0))[1]
+    frames = [in_room(0, here), *(in_room(i, away) for i in range(1, 12)), in_room(12, beside)]
+    loops, poses = Loops(1.0), torch.stack([here, *[away] * 11, beside])
+    loops.places.alike = lambda frame, others: []  # type: ignore[method-assign]
+    off = torch.cat([beside[:, :3], beside[:, 3:] + 0.1], 1)  # a drift
+    assert loops.find(frames[12], frames[:12], torch.cat([poses[:12], off[None]]))
+    assert loops.pairs.tolist() == [[0, 12]]
+    torch.testing.assert_close(loops.motions[0], motion(here, beside), atol=0.02, rtol=0)
 
 
 def test_features_find_a_fast_camera_that_the_map_does_not():

@@ -274,7 +274,9 @@ def test_a_scene_is_trained_from_words_and_judged(tmp_path, capsys, monkeypatch)
     assert run.dataset() == Words("a red ball", tiny_words.clip_folder())
     assert main(["eval", "run", "--views", "2"]) == 0
     assert evaluated(run.folder, CellSettings(eval_views=2))
-    (score,) = json.loads((tmp_path / "run/eval.json").read_text())["scores"]
+    judged = json.loads((tmp_path / "run/eval.json").read_text())
+    (score,) = judged["scores"]
+    assert -1 <= judged["baselines"]["empty view"] <= 1
     assert score["name"] == "similarity to the prompt" and -1 <= score["value"] <= 1
     assert main(["train", "dream-fields", "words:a шар", "--steps", "1", "--guidance", guidance, "--output", "b"]) == 2
     assert "no tokens for 'шар'" in capsys.readouterr().err

@@ -324,6 +324,9 @@ class App:
         self.runner.wake()
         return self.detail(item)
 
+    def kinds(self, item: Item, body: RunBody) -> list[dict[str, Any]]:
+        return sharing.kinds_for(item.run(body.run))
+
     def reveal(self, item: Item) -> dict[str, Any]:
         if not self.is_local:
             raise LumigraphError("A folder is shown to browsers on its machine; download the file instead")
@@ -363,93 +366,96 @@ def check_source(source: Path) -> None:
 # Routes
 
 
-def build(app: App) -> ASGIApp:
-    """The ASGI application: routes behind the guard."""
+class RequestHandlers:
+    """RequestHandlers of requests, for the routes of `build`."""
 
-    def asked(kind: Any, answer: Callable[..., Any]) -> Callable[[Request], Awaitable[Response]]:
+    def __init__(self, app: App):
+        self.app = app
+
+    def asked(self, kind: Any, answer: Callable[..., Any]) -> Callable[[Request], Awaitable[Response]]:
         """Route that reads a JSON body of a kind (None for none) and answers with JSON from a thread."""
 
         async def route(request: Request) -> Response:
             arguments: list[Any] = []
             if "key" in request.path_params:
-                arguments.append(await asyncio.to_thread(app.item, request.path_params["key"]))
+                arguments.append(await asyncio.to_thread(self.app.item, request.path_params["key"]))
             if kind is not None:
                 arguments.append(await body_of(request, kind))
             return Answer(await asyncio.to_thread(answer, *arguments))
 
         return route
 
-    async def page(request: Request) -> Response:
+    async def page(self, request: Request) -> Response:
         name = request.path_params.get("name", "index.html")
         if name not in os.listdir(PAGE):
             return PlainTextResponse("There is no such file.\n", 404)
         about = {"Cache-Control": "no-cache", "Content-Security-Policy": CONTENT_SECURITY}
         return FileResponse(PAGE / name, media_type=MEDIA_TYPES[Path(name).suffix], headers=about)
 
-    async def opened(request: Request) -> uploads.Upload:
+    async def opened(self, request: Request) -> uploads.Upload:
         about = (request.query_params.get(name, "") for name in ("name", "size", "hash"))
-        return await asyncio.to_thread(app.upload, request.path_params["key"], *about)
+        return await asyncio.to_thread(self.app.upload, request.path_params["key"], *about)
 
-    async def take(request: Request) -> Response:
+    async def take(self, request: Request) -> Response:
         offset = whole(request.query_params.get("offset", "0"))
-        return Answer(asdict(await (await opened(request)).take(offset, request.stream())))
+        return Answer(asdict(await (await self.opened(request)).take(offset, request.stream())))
 
-    async def have(request: Request) -> Response:
-        return Answer(asdict(await asyncio.to_thread((await opened(request)).arrived)))
+    async def have(self, request: Request) -> Response:
+        return Answer(asdict(await asyncio.to_thread((await self.opened(request)).arrived)))
 
-    async def leave_out(request: Request) -> Response:
-        item = await asyncio.to_thread(app.item, request.path_params["key"])
-        return Answer(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
+    async def leave_out(self, request: Request) -> Response:
+        item = await asyncio.to_thread(self.app.item, request.path_params["key"])
+        return Answer(await asyncio.to_thread(self.app.leave_out, item, request.query_params.get("name", "")))
 
-    async def picture(request: Request) -> Response:
-        item, query = await asyncio.to_thread(app.item, request.path_params["key"]), request.query_params
+    async def picture(self, request: Request) -> Response:
+        item, query = await asyncio.to_thread(self.app.item, request.path_params["key"]), request.query_params
         found = await asyncio.to_thread(rows.picture, item, query.get("name", ""), query.get("run", ""))
         side = min(max(whole(query.get("side", "320")), 16), 2048)
         is_large = await asyncio.to_thread(pictures.is_large_file, found)
-        small = await app.later(pictures.thumbnail, found, side, is_large=is_large)
+        small = await self.app.later(pictures.thumbnail, found, side, is_large=is_large)
         kept = "max-age=86400" if "v" in query else "no-cache"
         return Response(small, media_type="image/jpeg", headers={"Cache-Control": kept})
 
-    async def advice(request: Request) -> Response:
-        return Answer(await app.later(app.advice, app.item(request.path_params["key"])))
+    async def advice(self, request: Request) -> Response:
+        return Answer(await self.app.later(self.app.advice, self.app.item(request.path_params["key"])))
 
-    async def marks(request: Request) -> Response:
-        item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
+    async def marks(self, request: Request) -> Response:
+        item, name = self.app.item(request.path_params["key"]), request.query_params.get("name", "")
         return Answer(await asyncio.to_thread(progress.features, item, name))
 
-    async def code(request: Request) -> Response:
-        if not app.phone_url:
+    async def code(self, request: Request) -> Response:
+        if not self.app.phone_url:
             raise LumigraphError("Other machines cannot reach the app; start it with --host 0.0.0.0")
         key = request.query_params.get("key", "")
-        url = f"{app.phone_url}#{app.item(key).key}" if key else app.phone_url
+        url = f"{self.app.phone_url}#{self.app.item(key).key}" if key else self.app.phone_url
         return Response(qr_code(url), media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
 
-    async def shared(request: Request) -> Response:
-        item, name = app.item(request.path_params["key"]), request.path_params["name"]
+    async def shared(self, request: Request) -> Response:
+        item, name = self.app.item(request.path_params["key"]), request.path_params["name"]
         place = item.path / SHARED / name
         if not projects.is_plain_name(name) or place.is_symlink() or not place.is_file():
             raise LumigraphError(f"There is no file {name[:80]!r} here; make it again")
         shows = "inline" if "show" in request.query_params else "attachment"
         return FileResponse(place, filename=name, content_disposition_type=shows, headers=SHOWN_HEADERS)
 
-    async def forget(request: Request) -> Response:
-        item = await asyncio.to_thread(app.item, request.path_params["key"])
+    async def forget(self, request: Request) -> Response:
+        item = await asyncio.to_thread(self.app.item, request.path_params["key"])
         await asyncio.to_thread(jobs.forget_share, item, request.path_params["name"])
-        return Answer(await asyncio.to_thread(app.detail, item))
+        return Answer(await asyncio.to_thread(self.app.detail, item))
 
-    async def restore(request: Request) -> Response:
-        item = await asyncio.to_thread(projects.restore, app.root, request.path_params["name"])
+    async def restore(self, request: Request) -> Response:
+        item = await asyncio.to_thread(projects.restore, self.app.root, request.path_params["name"])
         return Answer({"key": item.key})
 
-    async def scene(request: Request) -> Response:
-        viewer, _ = app.viewer_of(request.path_params["key"], request.path_params["run"])
+    async def scene(self, request: Request) -> Response:
+        viewer, _ = self.app.viewer_of(request.path_params["key"], request.path_params["run"])
         if viewer is None:
             return PlainTextResponse("This scene is not open; load the page again.\n", 404)
         return await forward(request, viewer, "/" + quote(request.path_params.get("rest", "")))
 
-    async def scene_socket(socket: WebSocket) -> None:
+    async def scene_socket(self, socket: WebSocket) -> None:
         try:
-            viewer, view = app.viewer_of(socket.path_params["key"], socket.path_params["run"])
+            viewer, view = self.app.viewer_of(socket.path_params["key"], socket.path_params["run"])
         except LumigraphError:
             viewer, view = None, None
         if viewer is None:
@@ -457,50 +463,46 @@ def build(app: App) -> ASGIApp:
             return
         await forward_messages(socket, viewer, view)
 
-    def kinds(item: Item, body: RunBody) -> list[dict[str, Any]]:
-        return sharing.kinds_for(item.run(body.run))
 
+def build(app: App) -> ASGIApp:
+    """The ASGI application: routes behind the guard."""
+    here = RequestHandlers(app)
     item = "/api/items/{key}"
     routes = [
-        Route("/", page),
-        Route("/static/{name}", page),
-        Route("/api/home", asked(None, app.home)),
-        Route("/api/phone.svg", code),
-        Route("/api/projects", asked(NewBody, app.new), methods=["POST"]),
-        Route("/api/trash", asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
-        Route("/api/trash/{name}", restore, methods=["POST"]),
-        Route(item, asked(None, app.detail)),
-        Route(item, asked(TitleBody, app.rename), methods=["PATCH"]),
-        Route(item, asked(None, app.delete), methods=["DELETE"]),
-        Route(f"{item}/duplicate", asked(None, app.duplicate), methods=["POST"]),
-        Route(f"{item}/photographs", take, methods=["PUT"]),
-        Route(f"{item}/photographs", have),
-        Route(f"{item}/photographs", leave_out, methods=["DELETE"]),
-        Route(f"{item}/advice", advice),
-        Route(f"{item}/picture", picture),
-        Route(f"{item}/states", asked(None, progress.photographs_state)),
-        Route(f"{item}/features", marks),
-        Route(f"{item}/model", asked(None, progress.model)),
-        Route(f"{item}/make", asked(MakeBody, app.make), methods=["POST"]),
-        Route(f"{item}/pause", asked(None, lambda one: app.stop(one, "paused")), methods=["POST"]),
-        Route(f"{item}/stop", asked(None, lambda one: app.stop(one, "stopped")), methods=["POST"]),
-        Route(f"{item}/more", asked(MoreBody, app.more), methods=["POST"]),
-        Route(f"{item}/view", asked(RunBody, lambda one, body: app.view(one, body.run)), methods=["POST"]),
-        Route(f"{item}/kinds", asked(RunBody, kinds), methods=["POST"]),
-        Route(f"{item}/shares", asked(ShareBody, app.share), methods=["POST"]),
-        Route(f"{item}/reveal", asked(None, app.reveal), methods=["POST"]),
-        Route(f"{item}/shares/{{name}}", shared),
-        Route(f"{item}/shares/{{name}}", forget, methods=["DELETE"]),
-        Route("/scene/{key}/{run}/{rest:path}", scene),
-        WebSocketRoute("/scene/{key}/{run}", scene_socket),
-        WebSocketRoute("/scene/{key}/{run}/", scene_socket),
+        Route("/", here.page),
+        Route("/static/{name}", here.page),
+        Route("/api/home", here.asked(None, app.home)),
+        Route("/api/phone.svg", here.code),
+        Route("/api/projects", here.asked(NewBody, app.new), methods=["POST"]),
+        Route("/api/trash", here.asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
+        Route("/api/trash/{name}", here.restore, methods=["POST"]),
+        Route(item, here.asked(None, app.detail)),
+        Route(item, here.asked(TitleBody, app.rename), methods=["PATCH"]),
+        Route(item, here.asked(None, app.delete), methods=["DELETE"]),
+        Route(f"{item}/duplicate", here.asked(None, app.duplicate), methods=["POST"]),
+        Route(f"{item}/photographs", here.take, methods=["PUT"]),
+        Route(f"{item}/photographs", here.have),
+        Route(f"{item}/photographs", here.leave_out, methods=["DELETE"]),
+        Route(f"{item}/advice", here.advice),
+        Route(f"{item}/picture", here.picture),
+        Route(f"{item}/states", here.asked(None, progress.photographs_state)),
+        Route(f"{item}/features", here.marks),
+        Route(f"{item}/model", here.asked(None, progress.model)),
+        Route(f"{item}/make", here.asked(MakeBody, app.make), methods=["POST"]),
+        Route(f"{item}/pause", here.asked(None, lambda one: app.stop(one, "paused")), methods=["POST"]),
+        Route(f"{item}/stop", here.asked(None, lambda one: app.stop(one, "stopped")), methods=["POST"]),
+        Route(f"{item}/more", here.asked(MoreBody, app.more), methods=["POST"]),
+        Route(f"{item}/view", here.asked(RunBody, lambda one, body: app.view(one, body.run)), methods=["POST"]),
+        Route(f"{item}/kinds", here.asked(RunBody, app.kinds), methods=["POST"]),
+        Route(f"{item}/shares", here.asked(ShareBody, app.share), methods=["POST"]),
+        Route(f"{item}/reveal", here.asked(None, app.reveal), methods=["POST"]),
+        Route(f"{item}/shares/{{name}}", here.shared),
+        Route(f"{item}/shares/{{name}}", here.forget, methods=["DELETE"]),
+        Route("/scene/{key}/{run}/{rest:path}", here.scene),
+        WebSocketRoute("/scene/{key}/{run}", here.scene_socket),
+        WebSocketRoute("/scene/{key}/{run}/", here.scene_socket),
     ]
-    faults: dict[Any, Any] = {
-        LumigraphError: refused,
-        OSError: refused,
-        ClientDisconnect: refused,
-        msgspec.MsgspecError: refused,
-    }
+    faults: Any = dict.fromkeys((LumigraphError, OSError, ClientDisconnect, msgspec.MsgspecError), refused)
     inner = Starlette(routes=routes, exception_handlers=faults, lifespan=lambda _: living(app))
     return Gate(inner, app.address)
 

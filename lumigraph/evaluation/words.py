@@ -71,6 +71,6 @@ def evaluate_words(method: Method, words: Words, views: int | None = None) -> Wo
         "judge": str(words.guidance),
     }
     shown = [picture.cpu() for picture in pictures[:: max(1, count // SHOWN)][:SHOWN]]
-    nothing = words.frame.background.to(small)[:, None, None].expand_as(small[:1])
+    nothing = small.new_tensor(words.frame.background)[:, None, None].expand_as(small[:1])
     empty = guide.score(nothing, words.prompt).value
     return WordsEvaluation(words.prompt, guide.score(small, words.prompt), empty, protocol, shown)

@@ -174,26 +174,14 @@ def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
 
 def glb(file: MeshFile) -> Parts:
     """A binary glTF 2.0 of one mesh in its own frame, below a node that turns it upright."""
-    mesh, texture = file.mesh, file.mesh.texture
-    base = np.zeros(3) if file.offset is None else file.offset
+    mesh, base = file.mesh, np.zeros(3) if file.offset is None else file.offset
     place = {} if file.offset is None else {"translation": base.tolist()}
     columns = {
         "POSITION": gltf.Column((mesh.vertices - base).astype("<f4"), bounded=True),
         "NORMAL": gltf.Column(file.normals.astype("<f4")),
     }
-    material: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
-    pictures: list[tuple[str, bytes]] = []
-    if texture is None:
-        columns["COLOR_0"] = gltf.Column(linear_from_srgb(mesh.colours / 255).astype("<f4"))
-    else:
-        columns["TEXCOORD_0"] = gltf.Column(texture.uv.astype("<f4"))
-        pictures.append(("image/jpeg", jpeg(texture.colours)))
-        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-        if texture.normals is not None:
-            frame = tangents(mesh.vertices, mesh.faces, texture.uv, file.normals)
-            columns["TANGENT"] = gltf.Column(frame.astype("<f4"))
-            pictures.append(("image/png", png(texture.normals, colours=False)))
-            material["normalTexture"] = {"index": 1}
+    coloured, material, pictures = appearance(file)
+    columns |= coloured
     about: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
         "scene": 0,
@@ -218,7 +206,7 @@ def glb(file: MeshFile) -> Parts:
         "materials": [material],
     }
     if not file.lit:
-        material["extensions"], about["extensionsUsed"] = {"KHR_materials_unlit": {}}, ["KHR_materials_unlit"]
+        about["extensionsUsed"] = ["KHR_materials_unlit"]
     if file.origin is not None:
         about["nodes"][1]["extras"] = {"reference": file.origin.sentence, "origin": file.origin.to_json()}
     if pictures:
@@ -233,6 +221,27 @@ def glb(file: MeshFile) -> Parts:
         every.append(gltf.Column((vertices - base).astype("<f4"), bounded=True))
         every.append(gltf.Column(faces.astype("<u4").reshape(-1), target=gltf.INDICES))
     return {"": gltf.encoded(about, every, pictures)}
+
+
+def appearance(file: MeshFile) -> tuple[dict[str, gltf.Column], dict[str, Any], list[tuple[str, bytes]]]:
+    """Columns of colours or of a texture's places, the material, and its pictures."""
+    mesh, texture = file.mesh, file.mesh.texture
+    material: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+    pictures: list[tuple[str, bytes]] = []
+    if texture is None:
+        columns = {"COLOR_0": gltf.Column(linear_from_srgb(mesh.colours / 255).astype("<f4"))}
+    else:
+        columns = {"TEXCOORD_0": gltf.Column(texture.uv.astype("<f4"))}
+        pictures.append(("image/jpeg", jpeg(texture.colours)))
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        if texture.normals is not None:
+            frame = tangents(mesh.vertices, mesh.faces, texture.uv, file.normals)
+            columns["TANGENT"] = gltf.Column(frame.astype("<f4"))
+            pictures.append(("image/png", png(texture.normals, colours=False)))
+            material["normalTexture"] = {"index": 1}
+    if not file.lit:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    return columns, material, pictures
 
 
 def jpeg(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:

@@ -65,8 +65,6 @@ def probes_page(
     scale = length / float(extent.max())
     lift = 0.5 * float(extent.max())
     position = middle_of(points, normals, solid, lift * scale) if place is None else torch.tensor(place[0])
-    a, b, c = shown.vertices[shown.faces].unbind(1)
-    area = float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()) / 2
     opaque = torch.cat([normals, torch.ones_like(normals[..., :1])], -1)
     arrays = {
         "depth": numbers(depth),
@@ -89,15 +87,16 @@ def probes_page(
         "focal": lens.focal[0].tolist(),
         "pose": flat.pose[0].tolist(),
         "grid": grid_settings(grid, method.frame),
-        # A mesh shades as the ball of its mean shadow does (Cauchy): pi r^2 is a quarter of its surface.
-        "mesh": {
-            "position": position.tolist(),
-            "scale": scale,
-            "lift": lift,
-            "radius": math.sqrt(area / (4 * math.pi)),
-        },
+        "mesh": {"position": position.tolist(), "scale": scale, "lift": lift, "radius": shading_radius(shown)},
     }
     write_bytes(path, page_bytes("probes", settings, gzip.compress(data, 9, mtime=0), HELP), "page")
+
+
+def shading_radius(mesh: ShadedMesh) -> float:
+    """Radius of a ball that shades as a mesh does on average (Cauchy): pi r^2 is a quarter of its surface."""
+    a, b, c = mesh.vertices[mesh.faces].unbind(1)
+    area = float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()) / 2
+    return math.sqrt(area / (4 * math.pi))
 
 
 def flat_camera(camera: Camera, side: int = PICTURE_SIDE) -> Camera:

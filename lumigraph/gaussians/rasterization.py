@@ -3,7 +3,8 @@
 Code that calls `gsplat.rasterization` runs without CUDA by importing it from here.
 """
 
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -21,7 +22,7 @@ from .splatting import view_of
 MAX_DEGREE = 3
 RADIUS_DEVIATIONS = 3.33  # of a footprint at most, as meta["radii"] counts; there exp(-r^2 / 2) is 1/255
 MIN_OPACITY = 1e-10  # of a pixel whose depth is divided by it
-Mode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
 
 @at_work()
@@ -43,10 +44,10 @@ def rasterization(
     packed: bool = True,
     tile_size: int = 16,
     backgrounds: Float[Tensor, "camera channel"] | None = None,
-    render_mode: Mode = "RGB",
+    render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    rasterize_mode: str = "classic",
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
@@ -65,7 +66,8 @@ def rasterization(
     far_plane:  Gaussians with centres beyond are not rendered
     radius_clip: nor are those of at most so many pixels
     eps2d:      square pixels added to each footprint
-    render_mode: colours, accumulated depth D, expected depth ED = D / alpha; depth is the last channel
+    render_mode: one of MODES: colours, accumulated depth D, expected depth ED = D / alpha; depth is the last channel
+    rasterize_mode: "classic" or "antialiased" (Yu 2024, eq. 9)
     packed: the dictionary has a row for each pair of a camera and a Gaussian that it sees, else (C, N, ...)
     sparse_grad, tile_size, channel_chunk, segmented: accepted, and without effect on the result
 
@@ -76,7 +78,7 @@ def rasterization(
     Raises LumigraphError for options that the kernels do not have.
     """
     refused = {
-        f"render_mode={render_mode!r}": render_mode not in get_args(Mode),
+        f"render_mode={render_mode!r}": render_mode not in MODES,
         f"rasterize_mode={rasterize_mode!r}": rasterize_mode not in ("classic", "antialiased"),
         "absgrad": absgrad,
         "distributed": distributed,
@@ -125,7 +127,7 @@ def rasterization(
     for i in range(count):
         values = [colours(colors, means, viewmats[i], i, sh_degree)] if "RGB" in render_mode else []
         own = torch.cat([*values, means.new_zeros(len(means), 0)], -1)[rows[i]]
-        picture, depth, alpha = composited(*(part[i] for part in parts), own, (width, height))
+        picture, depth, alpha = composited([part[i] for part in parts], own, (width, height))
         if backgrounds is not None:
             picture = over(picture, alpha, backgrounds[i])
         if "ED" in render_mode:
@@ -177,14 +179,13 @@ def colours(
 
 
 def composited(
-    centres: Float[Tensor, "gaussian 2"],
-    conics: Float[Tensor, "gaussian 3"],
-    alphas: Float[Tensor, " gaussian"],
-    depths: Float[Tensor, " gaussian"],
-    values: Float[Tensor, "gaussian channel"],
-    size: tuple[int, int],
+    footprints: Sequence[Tensor], values: Float[Tensor, "gaussian channel"], size: tuple[int, int]
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Values, depth and opacity of each pixel. The kernel composites three values at a time."""
+    """Values, depth and opacity of each pixel. The kernel composites three values at a time.
+
+    footprints: centres, conics, opacities and depths of the Gaussians
+    """
+    centres, conics, alphas, depths = footprints
     channels = values.shape[-1]
     tiles = kernels.tile(centres, conics, alphas, depths, size)
     triples = torch.nn.functional.pad(values, (0, -channels % 3)) if channels else values.new_zeros(len(values), 3)

@@ -5,6 +5,7 @@ from .contexts import seeded as seeded
 from .field import Features as Features
 from .field import Field as Field
 from .field_method import FieldMethod as FieldMethod
+from .method import BaseConfig as BaseConfig
 from .method import Descend as Descend
 from .method import Lesson as Lesson
 from .method import Method as Method

@@ -19,10 +19,18 @@ from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..exchange.packing import Stored
+from ..files.ranges import Seed
 from .controls import Control, Value
 from .part import Part
 
 SEED_STRIDE = 0x9E3779B1  # between the generators of two seeds, odd (Knuth 1998, section 6.4)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BaseConfig:
+    """Numbers of the Config of every method here."""
+
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @runtime_checkable

@@ -26,8 +26,8 @@ from ..components.image_based.depth import hull_surface, mesh_distance, shape
 from ..datasets.mesh import Mesh, MeshTexture
 from ..datasets.scene import Frame, Photograph, Scene
 from ..errors import LumigraphError
-from ..files.ranges import Count, LearningRate, NonNegative, Seed, Width, between
-from ..method import Method
+from ..files.ranges import Count, LearningRate, NonNegative, Width, between
+from ..method import BaseConfig, Method
 from ..method.controls import Control, moment
 from ..system.progress import track
 from ..system.work import at_work
@@ -43,24 +43,23 @@ FIRST_SIDE = 4  # texels a side, from which the decoder begins
 NEAR = 1e-3  # scene units, before which triangles are cut off
 TEXTURE_WEIGHT = 1.0  # lambda_T of the loss
 MESH_WEIGHT = 1.0  # lambda_M of the loss
+VIEW_FEATURES = 8  # of the view's direction (section 4.2)
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the release, facebookresearch/multiface, models.py and train.py; its codes of 128 are the paper's."""
 
     texture_log2: Annotated[int, between(4, 10)] = 10  # side of the texture, log2; higher: finer, slower
     code: Count = 128  # numbers of an expression's code
     channels: Width = 16  # of the decoder's finest layer but one; coarser layers have up to 16 times as many
     max_channels: Width = 128  # of any layer
-    view_features: Count = 8  # of the view's direction (section 4.2)
     mesh_width: Width = 256  # of the layer before the mesh
     divergence_weight: NonNegative = 0.01  # lambda_Z
     mesh_rows: Annotated[int, between(5, 512)] = 73  # of the mesh's grid; 7306 vertices are the paper's
     mesh_columns: Annotated[int, between(5, 512)] = 101  # of the mesh's grid
     textures_per_step: Count = 16  # textures of a step; more are steadier, and cost time
     learning_rate: LearningRate = 3e-4  # Adam's learning rate
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,8 @@ class Networks(nn.Module):
         self.mesh_out = nn.Sequential(
             nn.Linear(c.code, c.mesh_width), nn.LeakyReLU(SLOPE), nn.Linear(c.mesh_width, numbers)
         )
-        self.view = nn.Linear(3, c.view_features)
-        self.first = nn.Linear(c.code + c.view_features, flat)
+        self.view = nn.Linear(3, VIEW_FEATURES)
+        self.first = nn.Linear(c.code + VIEW_FEATURES, flat)
         up = [*widths, 3]
         self.up = nn.ModuleList(
             Up(a, b, FIRST_SIDE << (k + 1)) for k, (a, b) in enumerate(zip(up[:-1], up[1:], strict=True))

@@ -22,9 +22,9 @@ from ..components.training.shape_points import PointNumbers, PointPools, sampled
 from ..datasets.scene import Frame
 from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
-from ..files.ranges import Count, Depth, Layers, LearningRate, Seed, Share, Width, between, changed
+from ..files.ranges import Count, Depth, Layers, LearningRate, Share, Width, between, changed
 from ..geometry import Similarity
-from ..method import seeded
+from ..method import BaseConfig, seeded
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -39,7 +39,7 @@ OFFSET = 0.01  # scene units from a scanned point along its normal, at which the
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; where it leaves them open, those of the published code (examples/chairs/specs.json)."""
 
     points: PointNumbers = PointNumbers()
@@ -57,7 +57,6 @@ class Config:
     code_learning_rate: LearningRate = 1e-3  # Adam's learning rate of the codes at first
     # Finding the code of a new shape.
     code_steps: Tally = 800  # steps that fit the code of a new shape, section 6.2; more take longer
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 FIRST_OUTPUT = 0.03  # deviation of the network's first outputs: beyond delta the clamped error has no gradient

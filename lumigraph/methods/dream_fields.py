@@ -26,8 +26,8 @@ from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_f
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import LearningRate, Seed, Width, changed
-from ..method import FieldMethod, seeded
+from ..files.ranges import LearningRate, Width, changed
+from ..method import BaseConfig, FieldMethod, seeded
 from ..volume import composite
 
 FINAL_LEARNING_RATE = 1e-3  # learning rate at the end of the budget, reached exponentially
@@ -35,7 +35,7 @@ DECAY_START = 0.3  # share of the budget before the learning rate falls
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Guidance by the paper's numbers; the field and its learning rates are Instant-NGP's."""
 
     table: HashNumbers = HashNumbers(sh_bands=1)
@@ -46,7 +46,6 @@ class Config:
     distillation: DistillationNumbers = DistillationNumbers()
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher: faster, may diverge
-    seed: Seed = 0  # seed of all random numbers; another seed gives another scene
 
 
 class DreamFields(FieldMethod):

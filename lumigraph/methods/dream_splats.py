@@ -24,16 +24,17 @@ from ..components.guidance import (
 )
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import CloudSize, PositiveShare, Seed, changed
+from ..files.ranges import CloudSize, changed
 from ..gaussians import Gaussians
 from ..gaussians.splatting import render, splat, view_of
-from ..method import Method
+from ..method import BaseConfig, Method
 
 GREY = 0.5  # colour of all Gaussians at first
+INITIAL_RADIUS = 0.5  # radius of the ball that Gaussians fill at first, in scene units
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Tang 2024, section 3.1 and the released code (configs/text.yaml)."""
 
     rates: RateNumbers = RateNumbers(
@@ -42,8 +43,6 @@ class Config:
     guidance: GuidanceNumbers = GuidanceNumbers()
     distillation: DistillationNumbers = DistillationNumbers()
     initial_gaussians: CloudSize = 5000  # Gaussians of the cloud, whose number stays; more hold finer detail
-    initial_radius: PositiveShare = 0.5  # radius of the ball that they fill at first, in scene units
-    seed: Seed = 0  # seed of all random numbers; another seed gives another scene
 
 
 class DreamSplats(Method):
@@ -57,7 +56,7 @@ class DreamSplats(Method):
         super().__init__(frame, c)
         chance = self.random(0)
         outward = torch.nn.functional.normalize(torch.randn(c.initial_gaussians, 3, generator=chance), dim=-1)
-        radius = c.initial_radius * torch.rand(c.initial_gaussians, 1, generator=chance) ** (1 / 3)
+        radius = INITIAL_RADIUS * torch.rand(c.initial_gaussians, 1, generator=chance) ** (1 / 3)
         cloud = round_gaussians(radius * outward, torch.full_like(outward, GREY), 0)
         self.cloud, self.guidance = Cloud(cloud, c.rates), Guidance(c.guidance, c.distillation)
         self.centre: tuple[Tensor, Tensor] | None = None

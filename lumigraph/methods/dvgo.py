@@ -26,10 +26,10 @@ from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between, changed
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Share, Width, between, changed
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
-from ..method import Field, FieldMethod, seeded
+from ..method import BaseConfig, Field, FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
@@ -52,7 +52,7 @@ HIDDEN_LAYERS = 2  # hidden layers of the colour network, section 6.1
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it or its published code gives them; `DVGO.preset` says what a CPU does."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20)  # 8192 rays, section 6.1
@@ -74,7 +74,6 @@ class Config:
     point_weight: NonNegative = 0.01  # the same in the fine stage; 0: off
     coarse_entropy_weight: NonNegative = 0.01  # weight of the entropy of opacity in the coarse stage, eq. 13; 0: off
     entropy_weight: NonNegative = 0.001  # the same in the fine stage; higher gives harder edges
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 EMPTY = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001

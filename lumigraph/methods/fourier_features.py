@@ -15,15 +15,15 @@ from ..camera.rays import Rays, Rendering
 from ..components.fields.encodings import FourierEncoding
 from ..components.fields.layers import Dense
 from ..datasets.scene import Batch, Frame, Scene
-from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
-from ..method import RayMethod, seeded
+from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Width, between
+from ..method import BaseConfig, RayMethod, seeded
 
 Encoding = Literal["none", "basic", "positional", "gaussian"]
 FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 alone they tell no pixel from the next
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers for pictures (section 6.1, and its appendix on implementation); those of a step are ours."""
 
     encoding: Encoding = "gaussian"  # encoding of coordinates ahead of the network, section 6.1; none gives a blur
@@ -34,7 +34,6 @@ class Config:
     learning_rate: LearningRate = 1e-3  # Adam's learning rate; higher learns faster, and may diverge
     pixels_per_step: BatchSize = 1 << 13  # random pixels in a step; more reduce noise, and cost time. The paper: all
     exact: bool = False  # multiply in float32 even where bfloat16 is faster; slower and more precise
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class FourierFeatures(RayMethod):

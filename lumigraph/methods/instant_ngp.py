@@ -21,8 +21,8 @@ from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame
 from ..exchange.packing import most_important
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width
-from ..method import FieldMethod, seeded
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Width
+from ..method import BaseConfig, FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..volume import composite
 
@@ -31,7 +31,7 @@ DECAY_START = 0.3  # share of the budget before the learning rate falls
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, but for huber_delta and scenes without bounds; `InstantNGP.preset` has a plain CPU's."""
 
     table: HashNumbers = HashNumbers()
@@ -46,7 +46,6 @@ class Config:
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from squared to linear; 1: always squared
     contraction: bool = True  # contract open captures and sample by proposals (Barron 2022); off: cascades, 5.4
     exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where exposures are found to differ
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class InstantNGP(FieldMethod):

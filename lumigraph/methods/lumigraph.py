@@ -18,7 +18,8 @@ from ..components.image_based.kept_views import focal_length
 from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import surface_seen
 from ..datasets.scene import Frame, Scene
-from ..files.ranges import Count, Pixels, Seed
+from ..files.ranges import Count, Pixels
+from ..method import BaseConfig
 from ..method.controls import Control
 from ..system.work import at_work
 
@@ -33,7 +34,7 @@ BORDER = 0.08  # of a photograph's side, over which its weight falls to its edge
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of Buehler 2001, which gives the form of the weights (sec. 4 and 5) and leaves their factors open."""
 
     geometry: Geometry = "stereo"  # source of depth: multi-view stereo, a layer `depth`, a mesh, or one plane
@@ -42,7 +43,6 @@ class Config:
     blended_views: Count = 4  # k: photographs blended at each pixel; more: smoother, more ghosts
     candidate_views: Count = 16  # photographs near a camera among which each pixel chooses
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Lumigraph(ImageBasedMethod):

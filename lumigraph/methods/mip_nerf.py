@@ -18,13 +18,13 @@ from ..components.sampling.samplers import sampling_bytes
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import BandSchedule, exponential_decay, joining_of
 from ..datasets.scene import Frame
-from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, changed
-from ..method import FieldMethod
+from ..files.ranges import LearningRate, NonNegative, Share, Width, changed
+from ..method import BaseConfig, FieldMethod
 from ..method.depth import DepthNumbers
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it gives them; then numbers that save time and keep the mathematics."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # section 4: with cones, more do no harm
@@ -38,7 +38,6 @@ class Config:
     learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 4; higher: faster, may diverge
     final_learning_rate: LearningRate = 5e-6  # learning rate at the end of the budget, section 4
     warmup: Share = 0.0025  # share of the budget in which the learning rate rises, section 4; 0: none
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class MipNeRF(FieldMethod):

@@ -19,15 +19,15 @@ from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import exponential_decay
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between, changed
-from ..method import FieldMethod
+from ..files.ranges import LearningRate, NonNegative, Share, Width, between, changed
+from ..method import BaseConfig, FieldMethod
 from ..method.depth import DepthNumbers
 
 DENSITY_NOISE = 1.0  # deviation of noise on captures' raw density in training, appendix A
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it gives them; then numbers that save time and keep the mathematics."""
 
     network: NetworkNumbers = NetworkNumbers()
@@ -42,7 +42,6 @@ class Config:
     coarse_loss_weight: NonNegative = 1.0  # weight of the coarse colours, eq. 6; 0, with one network: it only guides
     transmittance_threshold: Share = 0.0  # transmittance at which a ray terminates; higher is faster, less exact
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -24,8 +24,8 @@ from ..components.sampling.samplers import sampling_bytes
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
-from ..files.ranges import Layers, PositiveShare, Seed, Share, Width, changed
-from ..method import FieldMethod, Pass, seeded
+from ..files.ranges import Layers, PositiveShare, Share, Width, changed
+from ..method import BaseConfig, FieldMethod, Pass, seeded
 from ..method.controls import AVERAGE, Control
 from ..method.field import Densities, Points
 from ..volume import composite
@@ -121,7 +121,7 @@ TRANSIENT_WEIGHT = 0.01  # lambda_u, weight of transient density, section 5
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with NeRF's learning rates; `NeRFW.preset` has those of a plain CPU."""
 
     backbone: BackboneNumbers = BackboneNumbers(NetworkNumbers(position_frequencies=15))  # supplement
@@ -133,7 +133,6 @@ class Config:
     beta_min: PositiveShare = 0.03  # least uncertainty, section 5; higher gives uncertain pixels more weight
     transient_start: Share = 0.0  # share of the budget before the transient part is on; later: more is static
     own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 HIDDEN, SHOWN = "hidden", "shown"

@@ -28,8 +28,8 @@ from ..components.training.regularizers import normalized_distance
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
-from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ..method import FieldMethod, seeded
+from ..files.ranges import LearningRate, NonNegative, Positive, Width
+from ..method import BaseConfig, FieldMethod, seeded
 from ..method.controls import Control
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
@@ -40,7 +40,7 @@ FINAL_LEARNING_RATE = 1e-3  # learning rate at the end of the budget, reached ex
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers of the loss, and those of a hash table in place of its network."""
 
     table: HashNumbers = HashNumbers()
@@ -53,7 +53,6 @@ class Config:
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher learns faster, and may diverge
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen

@@ -25,12 +25,12 @@ from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS
 from ..components.tracking.trajectory import Pose, apply_twists
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphWarning
-from ..files.ranges import CloudSize, Count, Seed, between, changed
+from ..files.ranges import CloudSize, Count, between, changed
 from ..gaussians import Gaussians
 from ..gaussians.cloud import joined
 from ..gaussians.splatting import Splatted, render, splat, view_of
 from ..kernels.spherical_harmonics import K00
-from ..method import Descend, Method
+from ..method import BaseConfig, Descend, Method
 
 RADIUS_RATIO = 3.0  # farthest depth of the first frame over the scene's radius, in the release
 MAX_RADIUS = 0.1  # of the scene's radius: larger Gaussians are pruned
@@ -70,7 +70,7 @@ class SplatMappingNumbers:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The numbers of the paper and of its release for Replica."""
 
     tracking: TrackingNumbers = TrackingNumbers()
@@ -79,7 +79,6 @@ class Config:
     rates: RateNumbers = RateNumbers(means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, scales_lr=1e-3)
     frame_side: Annotated[int, between(0, 10_000)] = 0  # pixels of the longer side of frames, about; 0 as photographs
     max_gaussians: CloudSize = 4_000_000  # Gaussians at most; what is seen after that is not mapped
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class SplatSlam(Method):

@@ -20,8 +20,9 @@ from ..datasets.scene import Frame, Photograph, Scene
 from ..depth_maps import DepthMap, VoxelBlocks, release_weight, render_depth_maps, sensor_faults, trust_of
 from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import NonNegative, Positive, Seed, Share, between
-from ..method import Descend, RayMethod
+from ..files.ranges import NonNegative, Positive, Share, between
+from ..method import BaseConfig, Descend, RayMethod
+from ..method.depth import DEPTH_DEVIATION, DEPTH_LAYER, DEVIATION_LAYER
 from ..system.memory import free_memory
 
 Length = Annotated[float, between(0, 1e6)]  # of the capture's frame
@@ -34,7 +35,7 @@ SAMPLE_WEIGHT, SENSOR_SPAN = 3.0, (0.4, 4.0)  # of the release's weight: that of
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the released program for the Kinect (its parameter file; voxels of 4 mm are those of sec. 6)."""
 
     voxel_size: Length = 0.004  # edge of a voxel, in units of the capture (metres); 0: a 256th of the box of interest
@@ -45,7 +46,6 @@ class Config:
     max_depth: Length = 3.0  # in units of the capture, beyond which depth is left out; 0: none
     trusted_depth: Length = 0.0  # units of the capture to which depth counts in full, weighted by angle; 0: all
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 BY_ANGLE = Config(truncation=4.0, truncation_growth=0.0, weighting="angle", max_depth=0.0)  # for any unit and range
@@ -116,25 +116,29 @@ class TSDFFusion(RayMethod):
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
         """The next photograph with its depth, in the order of their names."""
         train = data.splits["train"]
-        return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), ("depth",))
+        layers = [name for name in (DEPTH_LAYER, DEVIATION_LAYER) if name in data.layers]
+        return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), layers)
 
     @torch.no_grad()
     def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
         """Fuse one depth map."""
-        self._fuse(
-            DepthMap.measured(batch.camera, batch.extra["depth"], batch.before(self.frame.background)), batch.mask
-        )
+        depth, stated = batch.extra[DEPTH_LAYER], batch.extra.get(DEVIATION_LAYER)
+        sure = None if batch.mask is None else batch.mask.float()
+        if stated is not None:  # inverse variance, beside that of a sure measurement
+            share = (DEPTH_DEVIATION * depth / stated).square().clamp(max=1).nan_to_num(1.0)
+            sure = share if sure is None else share * sure
+        self._fuse(DepthMap.measured(batch.camera, depth, batch.before(self.frame.background)), sure)
         return {}
 
-    def _fuse(self, seen: DepthMap, mask: Tensor | None = None) -> None:
+    def _fuse(self, seen: DepthMap, sure: Tensor | None = None) -> None:
         c = self.config
         farthest = c.max_depth or math.inf
         if c.weighting == "depth":
             trust = release_weight(seen, self.unit, SAMPLE_WEIGHT, SENSOR_SPAN, farthest)
         else:
             trust = trust_of(seen, c.trusted_depth * self.unit, farthest * self.unit)
-        if mask is not None:
-            trust = trust * mask.to(trust)
+        if sure is not None:
+            trust = trust * sure.to(trust)
         if not self.volume.fuse(seen, trust):
             warnings.warn(
                 f"Memory holds no more than {len(self.volume)} blocks, so new surfaces are left out; give a larger "

@@ -20,8 +20,9 @@ from ..components.image_based.surface import consensus
 from ..components.image_based.warping import behind, pushed, soft_splat
 from ..datasets.scene import Frame, Scene
 from ..depth_maps.optical_flow import optical_flow, round_trip_error, sampled
-from ..files.ranges import Pixels, Seed, between
+from ..files.ranges import Pixels, between
 from ..geometry import to_matrix, to_quaternion
+from ..method import BaseConfig
 from ..system.work import at_work
 
 MIN_COVER = 0.2  # sum of splatting weights from which on a pixel is covered
@@ -32,14 +33,13 @@ NEARNESS = 2.0  # power of the inverse distance of a photograph in its weight
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of softmax splatting, whose weight of occlusion is ours; the papers give none for depth."""
 
     by: Literal["depth", "flow"] = "depth"  # what photographs are warped by
     geometry: Literal["stereo", "measured"] = "stereo"  # source of depth: multi-view stereo, or a layer `depth`
     depth_size: Pixels = 400  # longer side of the depth maps; larger: finer edges, slower
     warped_views: Annotated[int, between(1, 16)] = 2  # photographs warped into a picture; more: fewer holes, slower
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class ViewInterpolation(ImageBasedMethod):

@@ -22,8 +22,8 @@ from ..components.training.schedules import falling
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..files.ranges import LearningRate, Seed, between, changed
-from ..method import Field, FieldMethod
+from ..files.ranges import LearningRate, between, changed
+from ..method import BaseConfig, Field, FieldMethod
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
@@ -36,7 +36,7 @@ VARIATION_WEIGHT = 1e-5  # of total variation; larger is smoother
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of a small grid: no paper's. Voxels and opacity at first are those of Sun 2022."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(
@@ -48,7 +48,6 @@ class Config:
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples, in voxels; larger is faster, and coarser
     learning_rate: LearningRate = 0.3  # of the grid; larger is faster, and noisier
     final_learning_rate: LearningRate = 0.03  # at the end of the budget
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 MAX_SMOOTHED = 1 << 12  # voxels of a step whose variation counts

@@ -4,18 +4,21 @@ Polycam, raw data: keyframes/cameras/N.json or keyframes/corrected_cameras/N.jso
 focal lengths, centre, size), keyframes/images/N.jpg or keyframes/corrected_images/N.jpg, keyframes/depth/N.png (16
 bits, millimetres). Record3D, RGBD: metadata.json (K by columns, poses as qx qy qz qw x y z, size of the depth) and
 rgbd/N.jpg, rgbd/N.depth (float32 metres, compressed by LZFSE). Camera axes are OpenGL's, y is up, depth is along the
-optical axis, 0 and NaN where nothing was measured. Lengths are metres.
+optical axis, 0 and NaN where nothing was measured. Lengths are metres. Of confidence (keyframes/confidence/N.png, 0 to
+255; rgbd/N.conf, 0 to 2) the lowest is left out; the others become the layer `depth_deviation`.
 
 Stray Scanner: odometry.csv (timestamp, frame, x, y, z, qx, qy, qz, qw, or the last seven; +y down, +z forward),
-camera_matrix.csv, depth/000000.png or .npy (millimetres), confidence/000000.png (0 to 2; depth of 0 is left out), and
+camera_matrix.csv, depth/000000.png or .npy (millimetres), confidence/000000.png (0 to 2), and
 the film rgb.mp4, of which `lumigraph capture FOLDER` writes frames, as rgb/000000.jpg.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +42,8 @@ EXPECTED_FILES = {
 OPENCV = np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera axes
 UP = (0.0, 1.0, 0.0)
 MILLIMETRES = 1e-3
+TRUSTED = 0, 1, 1  # factor of depth by its confidence, 0 to 2
+DEVIATIONS = 0, 0.03, 0.01  # standard deviation of depth by its confidence, as a share of the depth
 STRAY_FILES = "odometry.csv", "camera_matrix.csv"
 
 
@@ -135,7 +140,7 @@ def read_stray(folder: Path) -> Capture:
             rotation = to_matrix(torch.tensor([[qw, qx, qy, qz]], dtype=torch.float64))[0].numpy()
             pose = np.concatenate([rotation, np.array(place)[:, None]], 1)
             files = {kind: find_measured(folder / kind, number) for kind in ("depth", "confidence")}
-            planes = {} if files["depth"] is None else {"depth": confident(files["depth"], files["confidence"])}
+            planes = beside_picture(files["depth"], files["confidence"])
             size = measure(pictures[number])[0]
             shots.append(Shot(f"rgb/{number:06}", pose, lens, size, {1: pictures[number]}, planes=planes))
     return Capture(str(folder), shots, up=UP)
@@ -145,18 +150,45 @@ def find_measured(folder: Path, number: int) -> Path | None:
     return next((x for suffix in (".png", ".npy") if (x := folder / f"{number:06}{suffix}").is_file()), None)
 
 
-def confident(depth: Path, confidence: Path | None) -> PixelPlane:
-    """Depth of a file, 0 where its confidence is 0."""
-    if confidence is None:
-        return PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))
+def sure_planes(
+    depth: Callable[[], np.ndarray], confidence: Callable[[], np.ndarray], identity: str, scale: float, kind: Any
+) -> dict[str, PixelPlane]:
+    """Depth without the pixels of confidence 0, and its standard deviation."""
+    kinds = {"depth": (TRUSTED, np.dtype(kind)), "depth_deviation": (DEVIATIONS, np.dtype(np.float32))}
+    return {
+        name: PixelPlane(
+            partial(by_confidence, depth, confidence, shares), "z-depth", scale, (0,), dtype=dtype,
+            identity=f"{identity} {name}",
+        )
+        for name, (shares, dtype) in kinds.items()
+    }  # fmt: skip
+
+
+def by_confidence(
+    depth: Callable[[], np.ndarray], confidence: Callable[[], np.ndarray], shares: tuple[float, ...]
+) -> np.ndarray:
+    """Depth times a factor for each confidence: 0 to 2 as ARKit has it, or grey levels up to 255 as Polycam."""
+    found, sure = depth(), confidence()
+    if sure.shape != found.shape:
+        raise LumigraphError(f"Depth is {found.shape} and its confidence {sure.shape} pixels large; export both again")
+    return found * np.array(shares)[np.digitize(sure, (1, 2 if sure.max() <= 2 else 255))]
+
+
+def file_numbers(path: Path) -> np.ndarray:
+    with readable(path):
+        return read_numbers(path, "depth" if path.parent.name == "depth" else "")
+
+
+def beside_picture(depth: Path | None, confidence: Path | None) -> dict[str, PixelPlane]:
+    """Depth in millimetres and confidence of two files, where they exist."""
+    if depth is None or not depth.is_file():
+        return {}
+    if confidence is None or not confidence.is_file():
+        return {"depth": PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))}
     identity = f"{depth.resolve()} {stat(depth)} {stat(confidence)}"
-    values = partial(masked_depth, depth, confidence)
-    return PixelPlane(values, "z-depth", MILLIMETRES, unknown=(0,), dtype=np.dtype(np.uint16), identity=identity)
-
-
-def masked_depth(depth: Path, confidence: Path) -> np.ndarray:
-    with readable(depth):
-        return np.where(read_numbers(confidence) > 0, read_numbers(depth, "depth"), 0).astype(np.uint16)
+    return sure_planes(
+        partial(file_numbers, depth), partial(file_numbers, confidence), identity, MILLIMETRES, np.uint16
+    )
 
 
 def opencv(pose: np.ndarray) -> np.ndarray:
@@ -174,8 +206,7 @@ def read_polycam(folder: Path) -> Capture:
             missing.append(f"keyframes/{corrected}images/{path.stem}")
             continue
         lens = Pinhole(torch.tensor([[said.fx, said.fy]]), torch.tensor([[said.cx, said.cy]]))
-        depth = frames / "depth" / f"{path.stem}.png"
-        planes = {"depth": PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))} if depth.is_file() else {}
+        planes = beside_picture(*(frames / kind / f"{path.stem}.png" for kind in ("depth", "confidence")))
         size = said.size
         if size is None and is_file(
             first := frames / "cameras" / path.name
@@ -200,15 +231,19 @@ def read_record3d(folder: Path) -> Capture:
         rotation = to_matrix(torch.tensor([[qw, qx, qy, qz]], dtype=torch.float64))[0].numpy()
         pose = opencv(np.concatenate([rotation, np.array(place)[:, None]], 1))
         lens = Pinhole(torch.tensor([[fx, fy]]), torch.tensor([[cx, cy]]))
-        values = partial(unpacked, depth, (said.dh, said.dw))
-        plane = PixelPlane(values, "z-depth", unknown=(0.0,), dtype=np.dtype(np.float32), identity=str(depth))
+        shape, sure = (said.dh, said.dw), depth.with_suffix(".conf")
+        values = partial(unpacked, depth, shape, np.float32)
+        about = str(depth), 1.0, np.dtype(np.float32)
+        plane = PixelPlane(values, "z-depth", unknown=(0.0,), dtype=about[2], identity=about[0])
         planes = {"depth": plane} if depth.is_file() else {}
+        if planes and sure.is_file():
+            planes = sure_planes(values, partial(unpacked, sure, shape, np.uint8), *about)
         shots.append(Shot(f"rgbd/{i}", pose, lens, (said.w, said.h), {1: picture}, planes=planes))
     return Capture(str(folder), shots, missing=missing, up=UP)
 
 
-def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Depth of a Record3D file. Raises LumigraphError without the LZFSE library, or for another size."""
+def unpacked(path: Path, shape: tuple[int, int], kind: Any) -> np.ndarray:
+    """Depth or confidence of a Record3D file. Raises LumigraphError without the LZFSE library, or for another size."""
     try:
         import liblzfse
     except ImportError as fault:
@@ -217,4 +252,4 @@ def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
         ) from fault
     height, width = shape
     with reading(path, f"holds no {width}x{height} numbers", "export it again"):
-        return np.frombuffer(liblzfse.decompress(read_bytes(path)), np.float32).reshape(shape)
+        return np.frombuffer(liblzfse.decompress(read_bytes(path)), kind).reshape(shape)

@@ -1,6 +1,5 @@
 """Collections of procedural objects: "toys,count=200" are many, "toys,member=3" is one of them as a scene of its own.
-So
-are meshes: "path/to/folder" is a collection of all its meshes, "path/to/mesh.obj" a scene.
+So are meshes: "path/to/folder" is a collection of all its meshes, "path/to/mesh.obj" a scene.
 
 Pictures are rendered once and cached, since training passes over a collection many times.
 """

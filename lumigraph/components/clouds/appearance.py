@@ -66,7 +66,7 @@ class SplatAppearance(Addition):
     # Training
 
     @torch.no_grad()
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         """Test whether photographs differ, with the setting auto; initialise uniform skies."""
         if self.numbers.appearance == "auto":
             stops = spread_of_light(data) or 0.0

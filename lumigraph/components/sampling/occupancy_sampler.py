@@ -252,7 +252,7 @@ class OccupancySampler(Sampler):
     def _max_cells(self) -> int:
         return self.schedule.max_cells or self.numbers.samples_per_step * CELLS_PER_SAMPLE
 
-    def after_step(self, method: Any, step: int) -> None:
+    def after_step(self, method: object, step: int) -> None:
         """Set the next step's number of rays to evaluate about `samples_per_step` samples, for constant time and memory
         of steps (section 5.4)."""
         if self.adapts:

@@ -206,7 +206,7 @@ class ProposalSampler(Sampler):
         if len(self.surface):
             self.proposal.begin(self.surface)
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         self.progress = progress
         self.proposal.anneal(1.0 if len(self.surface) else progress)
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,10 +21,10 @@ from torch.nn.functional import normalize
 
 from ...datasets.scene import Frame, Scene
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
-from ...errors import LumigraphError
+from ...errors import LumigraphError, LumigraphWarning
 from ...exchange.bones import SUFFIXES, read_motion
 from ...files.ranges import LearningRate, Share
-from ...geometry import multiply, to_matrix, to_quaternion
+from ...geometry import evenly, multiply, to_matrix, to_quaternion
 from ...method import Part
 from ...method.controls import Control, Value, moment
 from ..training.pose_refinement import PoseAdam
@@ -33,6 +34,7 @@ CAPTURED, AT_REST = "captured", "rest"  # values of the control `pose` for bones
 FALL = 0.05  # of the rate of corrections that is left at the end of the budget
 MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
+CHECKED_PHOTOGRAPHS, BACKGROUND_DIFFERENCE, MIN_BACKGROUND = 4, 0.1, 0.5  # of a colour; share of a picture's edge
 KEPT_CLIPS = 8  # files of poses that are kept in memory
 MIN_MOMENTS = 5  # that a smoothing spline goes through
 SMOOTHINGS = 10  # over the budget, of given poses at its beginning and then of corrections
@@ -107,8 +109,9 @@ class BoneMotion(Part):
     # Corrections
 
     @torch.no_grad()
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         """Smooth the given poses; later smoothings take as long, and as many follow as their share of time allows."""
+        warn_of_background(data)
         if not self.numbers.pose_smoothing or data.cameras.time is None:
             return
         times = data.cameras.time[data.splits["train"]].unique().to(self.times)
@@ -121,7 +124,7 @@ class BoneMotion(Part):
         self.smoothings += SMOOTHINGS - int(min(count, SMOOTHINGS))
 
     @torch.no_grad()
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         """Smooth a table's corrections. Those of a network follow smoothly from the given poses."""
         if self.numbers.pose_smoothing and progress * SMOOTHINGS >= self.smoothings + 1:
             self.smoothings += 1
@@ -237,6 +240,26 @@ def clip_of(path: str, frame: Frame) -> BoneMotion:
     """Poses in a file for the bones of a scene, at its times. Raises LumigraphError for a file without any."""
     file = Path(path).expanduser()
     return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
+
+
+def warn_of_background(data: Scene) -> None:
+    """Warn of photographs with a background, which no bone moves and no body shows."""
+    for index in evenly(data.splits["train"].tolist(), CHECKED_PHOTOGRAPHS):
+        shot = data.photograph(index)
+        seen = (shot.before(data.frame.background) - torch.tensor(data.frame.background)).abs().amax(
+            -1
+        ) > BACKGROUND_DIFFERENCE
+        edge = torch.ones_like(seen)
+        edge[2:-2, 2:-2] = False
+        if shot.mask is None and float(seen[edge].float().mean()) > MIN_BACKGROUND:
+            warnings.warn(
+                f"{data.source}: photographs show a background around the body, which a body on bones cannot show, so "
+                "it spoils colours and scores; give the body's masks (a folder masks) or pictures with alpha, or train "
+                "deformable-splatting, which shows both",
+                LumigraphWarning,
+                stacklevel=2,
+            )
+            return
 
 
 def smoothed_poses(

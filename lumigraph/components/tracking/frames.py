@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -14,22 +15,27 @@ from ...camera import Camera
 from ...camera.rays import Rays
 from ...datasets.scene import Scene
 from ...method.depth import DEPTH_LAYER, DEVIATION_LAYER
-from .alignment import level_step, sensor_deviation
+from .alignment import GREY, level_step, sensor_deviation
 from .trajectory import Pose
 
 COMPARED_POINTS = 2000  # pixels of a frame that are compared with another's depth
 COMPARED_DEVIATIONS = 3.0  # of the depth, within which two measurements agree
 MIN_AGREEMENT = 0.65  # share of common points that must agree
+MISSED = 0.2  # of luminance, for a point that is not on the other's depth
 MIN_COMMON = 0.2  # share of a frame's points in common with another, below which they are not compared
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Shares of a frame's points that are in another's picture, on its depth, and in front of that."""
+    """Shares of a frame's points that are in another's picture, on its depth, and in front of that.
+
+    error: mean difference of luminance, MISSED for points that are not on its depth
+    """
 
     common: float
     near: float
     front: float
+    error: float = math.inf
 
     @property
     def agrees(self) -> bool:
@@ -108,8 +114,11 @@ class DepthFrame:
         ahead = other.depth[place] - points.norm(dim=-1)
         off = COMPARED_DEVIATIONS * torch.maximum(self.deviation[pixels], other.deviation[place])
         seen = inside & ahead.isfinite()
-        shares = [float(x.float().mean()) for x in (seen, seen & (ahead.abs() < off), seen & (ahead >= off))]
-        return Comparison(*shares)
+        near = seen & (ahead.abs() < off)
+        away = ((self.rgb[pixels] - other.rgb[place]) @ self.rgb.new_tensor(GREY)).abs()
+        error = torch.where(near, away, MISSED)[seen].mean() if seen.any() else math.inf
+        common, close, front = (float(x.float().mean()) for x in (seen, near, seen & (ahead >= off)))
+        return Comparison(common, close, front, float(error))
 
     def sample_pixels(self, count: int, generator: torch.Generator, measured: bool = False) -> Int[Tensor, " chosen"]:
         """Random pixels; with `measured`, among those with depth."""

@@ -23,7 +23,7 @@ from ...datasets.scene import Photograph
 from ...method import Part
 from ..training.bundle_adjustment import rotation_vector
 from ..training.shared_points import Seen, features, matched, resected
-from .frames import DepthFrame
+from .frames import MIN_COMMON, DepthFrame
 from .trajectory import Pose, apply_twists, relative
 
 THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
@@ -31,7 +31,7 @@ HOLE = 2  # pixels to measured depth, up to which a feature has that depth
 MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
-MIN_INLIERS = 25  # matches that a loop's motion explains
+MIN_INLIERS = 15  # matches that a loop's motion explains; dense depth must agree, too
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -102,14 +102,19 @@ class Loops(Part):
         self.register_buffer("motions", torch.zeros(0, 3, 4))
         self.places = FramePlaces()
 
-    def find(self, frame: DepthFrame, older: list[DepthFrame]) -> bool:
-        """Search the place of a new keyframe among older ones; True if found."""
-        for other in self.places.alike(frame, older[:-MIN_AGE]):
-            motion = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
-            if motion is not None and frame.compared(other, motion).agrees:
+    def find(self, frame: DepthFrame, older: list[DepthFrame], poses: Float[Tensor, "image 3 4"]) -> bool:
+        """Search the place of a new keyframe among older ones, those that look alike or see most of its points at the
+        poses of now; True if found."""
+        old = older[:-MIN_AGE]
+        common = [frame.compared(x, motion(poses[x.index], poses[frame.index])).common for x in old]
+        near = sorted(range(len(old)), key=lambda i: -common[i])[:CANDIDATES]
+        beside = [old[i] for i in near if common[i] >= MIN_COMMON]
+        for other in {x.index: x for x in [*beside, *self.places.alike(frame, old)]}.values():
+            found = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
+            if found is not None and frame.compared(other, found).agrees:
                 pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
                 self.pairs = torch.cat([self.pairs, pair])
-                self.motions = torch.cat([self.motions, motion[None].to(self.motions)])
+                self.motions = torch.cat([self.motions, found[None].to(self.motions)])
                 return True
         return False
 

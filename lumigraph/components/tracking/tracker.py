@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ class Tracker(Part):
         self._warned = False
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         if "depth" not in data.layers:
             raise LumigraphError(
                 f"{data.source} has no depth, which maps of depth cameras are made of; train instant-ngp or "
@@ -112,7 +112,7 @@ class Tracker(Part):
         """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
         keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
         older = [self.load_keyframe(data, i) for i in keyframes if i != frame.index]
-        if self.loops is None or not self.loops.find(frame, older):
+        if self.loops is None or not self.loops.find(frame, older, self.trajectory.poses):
             return False
         self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
         return True
@@ -152,7 +152,7 @@ class Tracker(Part):
             pose
             for start in self.by_features(frame, data, known[-1])
             if self.plausible(last, start, limit)
-            for pose in (find(frame, start), start)
+            for pose in self.closest_first(frame, [find(frame, start), start], data, known[-1])
         )
         reason = LOST if frame.measured.any() else UNMEASURED
         for pose in chain(by_features, by_velocity) if fast else chain(by_velocity, by_features):
@@ -189,6 +189,15 @@ class Tracker(Part):
             points, bearings = (torch.cat(x) for x in zip(*matches(group), strict=True))
             if (found := resected(points, bearings, MIN_MATCHES)) is not None:
                 yield found.to(self.trajectory.poses)
+
+    def closest_first(self, frame: DepthFrame, poses: list[Pose], data: Scene, last: int) -> list[Pose]:
+        """Poses by their error of colours and depth against the last known frame and the latest keyframe, which the map
+        does not spoil: before a bare wall a map lets a pose slide."""
+        others = [self.frame(data, i) for i in dict.fromkeys([last, *self.keyframes[-1:]])]
+        errors = [
+            sum(frame.compared(x, motion(self.trajectory.poses[x.index], p)).error for x in others) for p in poses
+        ]
+        return [poses[i] for i in sorted(range(len(poses)), key=errors.__getitem__)]
 
     @torch.no_grad()
     def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -48,7 +48,7 @@ class Trajectory(Part):
         self.register_buffer("anchor", torch.full((image_count,), -1))
 
     @torch.no_grad()
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         self.poses.copy_(data.cameras.pose)
 
     def know(self, index: int, pose: Pose, anchor: int) -> None:

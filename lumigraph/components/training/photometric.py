@@ -119,7 +119,7 @@ class Exposure(Part):
         self.log_gain = nn.Parameter(torch.zeros(image_count, 3))
         self.register_buffer("differ", torch.tensor(setting == "yes"))
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         """Test whether photographs differ, with the setting auto."""
         if self.setting != "auto":
             return

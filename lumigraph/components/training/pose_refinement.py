@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -72,10 +72,10 @@ class PoseRefinement(Part):
         self.register_buffer("progress", torch.tensor(1.0))
         self.register_buffer("found", torch.tensor(False))
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         self.find(data, self.matching)
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         self.progress.fill_(progress)
 
     def choose_axes(self, cameras: Camera, frame: Frame) -> None:

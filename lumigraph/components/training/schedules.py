@@ -80,7 +80,7 @@ class BandSchedule(Part):
         self.share = share
         self.register_buffer("joined", torch.zeros(()))
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         self.joined.fill_(max(float(self.joined), min(progress / self.share, 1.0)))
 
     def weights(self, bands: int) -> Float[Tensor, " band"] | None:

@@ -34,8 +34,7 @@ def _cost(
     warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples
 ):
     """One less the correlation. The loop stores nothing, so that the compiler vectorises it, look-ups included. Arrays
-    are
-    passed whole: reference counting of a view takes as long as the loop.
+    are passed whole: reference counting of a view takes as long as the loop.
 
     n: number of the neighbour; p, m: of the pixel and its plane
     values, weights: the neighbours' W b and W with a border; weights are read only where `masked`

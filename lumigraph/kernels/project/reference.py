@@ -18,8 +18,8 @@ def run(means, quaternions, scales, opacities, harmonics, view, bands, blur, com
     z = torch.where(front, p[:, 2], 1)
     plane = p[:, :2] / z[:, None]
     x, y = plane[:, 0].clamp(limits[0], limits[1]), plane[:, 1].clamp(limits[2], limits[3])
-    bent, (xx, xy, yy) = bend(x, y, distortion.unbind())
-    slope = focal[:, None] * torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2)  # of the lens
+    bent, jacobian = bend(x, y, distortion.unbind())
+    slope = focal[:, None] * torch.stack(jacobian, -1).view(-1, 2, 2)  # of the lens
     beyond = plane - torch.stack([x, y], -1)
     centres = focal * torch.stack(bent, -1) + (slope @ beyond[:, :, None])[:, :, 0] + centre
 

@@ -21,11 +21,11 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import PositiveShare, Seed, changed
+from ...files.ranges import PositiveShare, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
-from ...method import seeded
+from ...method import BaseConfig, seeded
 from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
@@ -37,7 +37,7 @@ INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaus
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Kerbl's (2023) numbers of the cloud, as in MANUS; those of bones and weights are ours, not the paper's."""
 
     cloud: CloudNumbers = CloudNumbers(initial_gaussians=10_000, photographs=AppearanceNumbers(appearance="no"))
@@ -45,7 +45,6 @@ class Config:
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
     bones: BoneNumbers = BoneNumbers(pose_correction="table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class ArticulatedSplatting(Articulated, CloudMethod):

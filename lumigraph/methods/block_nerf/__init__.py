@@ -25,8 +25,8 @@ from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
-from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, changed
-from ...method import FieldMethod, seeded
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Steps, Width, changed
+from ...method import BaseConfig, FieldMethod, seeded
 from ...method.field import Directions, Points
 from ...volume import composite
 from .parts import Exposures, Moving, Visibility
@@ -35,7 +35,7 @@ VISIBILITY_FREQUENCIES = 6  # octaves of positions in the visibility network, se
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it gives them; `BlockNeRF.preset` has a CPU's."""
 
     backbone: BackboneNumbers = BackboneNumbers(
@@ -61,7 +61,6 @@ class Config:
     head_width: Width = 128  # of the network: channels of a hidden colour layer, appendix; wider costs time
     warmup_steps: Steps = 1024  # steps in which the learning rate rises, appendix; more begin more carefully
     coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 OWN_SKIES = True  # a sky for each photograph behind open captures, by hash table

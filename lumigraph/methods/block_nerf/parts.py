@@ -52,7 +52,7 @@ class Exposures(Part):
         self.register_buffer("known", torch.zeros(image_count, dtype=torch.bool))
         self.register_buffer("span", torch.zeros(2))
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         if "exposure" not in data.about:
             return
         stops, train = data.about["exposure"].to(self.stops).log2(), data.splits["train"]  # NaN where not known
@@ -101,7 +101,7 @@ class Exposures(Part):
         """Photographs, where exposures are known."""
         return () if self.usual_stops is None else (Photograph,)
 
-    def adapted(self, method: Any, evidence: Photograph) -> Exposures:
+    def adapted(self, method: object, evidence: Photograph) -> Exposures:
         """The part with the exposure of an evidence photograph, found by its camera's `image_index`."""
         adapted, image = copy.copy(self), evidence.camera.image_index
         adapted.taken = None if image is None else self.stops_of(int(image[0]))
@@ -156,7 +156,7 @@ class Moving(Part):
         usual = torch.where(known, around, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
         self.still.copy_((around <= most) | (around <= MUCH * usual) | ~known)
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         if progress >= BEGINS and step % EVERY == 0:
             self.judge()
 

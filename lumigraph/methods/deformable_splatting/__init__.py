@@ -19,12 +19,12 @@ from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import Seed, Share, changed
+from ...files.ranges import Share, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
 from ...geometry import to_matrix
-from ...method import seeded
+from ...method import BaseConfig, seeded
 from ...method.controls import Control, moment
 from .planes import MotionNumbers, PlaneMotion
 
@@ -34,7 +34,7 @@ MIN_FOLLOWED_OPACITY = 0.1  # of these Gaussians
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The numbers of the authors' release, with Kerbl's (2023) of the cloud."""
 
     cloud: CloudNumbers = CloudNumbers(initial_gaussians=2000, photographs=AppearanceNumbers(appearance="no"))
@@ -42,7 +42,6 @@ class Config:
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     motion: MotionNumbers = MotionNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class DeformableSplatting(CloudMethod):

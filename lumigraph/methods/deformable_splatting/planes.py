@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -264,7 +264,7 @@ class PlaneMotion(Addition):
         self.moves, self.neighbours = self.moves[source], torch.where(left < 0, own[:, None], left)
         self.carriers, self.shares = self.carriers[source], self.shares[source]
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         self.active.fill_(progress >= self.numbers.still_until)
 
     def before_raster(self, step: Step) -> None:

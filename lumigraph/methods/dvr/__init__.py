@@ -22,15 +22,17 @@ from ...components.sampling.surface_method import SHADINGS, SurfaceMethod
 from ...components.training.schedules import BandSchedule, exponential_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...method import seeded
+from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Share, Width, between
+from ...method import BaseConfig, seeded
 from .fields import LOGIT_SCALE, OccupancyField, TableField
 
 MarchSteps = Annotated[int, between(4, 4096)]
 
+NORMAL_WEIGHT = 0.05  # weight of L_normal, which smooths the surface
+
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The numbers of the paper's multi-view reconstruction, as its published code has them (configs/)."""
 
     table: TableNumbers = TableNumbers()
@@ -42,13 +44,11 @@ class Config:
     hull_cells: Cells = 0  # cells per axis of the visual hull, outside of which rays do not look; 0: they look anywhere
     rays_per_step: BatchSize = 2048  # rays of a step; more reduce noise, and cost time
     depth_weight: NonNegative = 0.0  # weight of L_depth, for photographs with depth; 0: depth is not read
-    normal_weight: NonNegative = 0.05  # weight of L_normal; higher smooths the surface
     neighbour_distance: Positive = 2e-3  # side of the cube around a point from which L_normal draws its neighbour
     difference_step: Positive = 2e-3  # scene units between two values whose difference is a normal's component
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 2.5e-5  # learning rate at the end of the budget, reached exponentially
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -152,11 +152,10 @@ class DVR(SurfaceMethod):
         if c.depth_weight:
             error = (t[met] - batch.extra["depth"][met])[right].abs()
             terms["depth"] = c.depth_weight * error[error.isfinite()].sum() / count
-        if c.normal_weight:
-            here = points.detach()
-            shift = torch.rand(here.shape, generator=generator).to(here) - 0.5
-            normals = (normalize(self._differences(x), dim=-1) for x in (here, here + c.neighbour_distance * shift))
-            terms["normal"] = c.normal_weight * sum_of_lengths(*normals) / count
+        here = points.detach()
+        shift = torch.rand(here.shape, generator=generator).to(here) - 0.5
+        normals = (normalize(self._differences(x), dim=-1) for x in (here, here + c.neighbour_distance * shift))
+        terms["normal"] = NORMAL_WEIGHT * sum_of_lengths(*normals) / count
         terms |= self._mask_terms(rays, t.detach(), inside, samples, generator)
         shown = self.background.repeat(count, 1).index_copy(0, met, rgb.detach())
         self.figures = {"mse": float((shown - batch.before(self.background)).square().mean()), "met": len(met) / count}

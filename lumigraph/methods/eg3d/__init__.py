@@ -34,8 +34,8 @@ from ...components.training.adversarial import (
 from ...datasets.collection import Collection
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Width, between
-from ...method import Descend, Method, frozen, seeded
+from ...files.ranges import Layers, LearningRate, NonNegative, Positive, RaySamples, Width, between
+from ...method import BaseConfig, Descend, Method, frozen, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...system.work import at_work
@@ -60,7 +60,7 @@ R1_INTERVAL = 16  # steps from one R1 to the next
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers for FFHQ at 512 pixels, as its published code has them (NVlabs/eg3d, train.py)."""
 
     picture_size: Side = 512  # pixels across of pictures, a power of two; larger ones cost time
@@ -93,7 +93,6 @@ class Config:
     # Finding the code of photographs (Roich 2021, pivotal tuning).
     code_steps: Tally = 500  # steps that fit a style to photographs; more take longer
     tune_steps: Tally = 500  # steps that tune the generator to the photographs; 0: style alone
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for sizes that do not fit together."""

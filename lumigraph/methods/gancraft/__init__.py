@@ -23,8 +23,8 @@ from ...components.training.adversarial import discriminator_loss, generator_los
 from ...components.training.row_optimizers import exchange
 from ...datasets.scene import Frame
 from ...datasets.world import LABELS, BlockWorld
-from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Seed, Share, Width, between
-from ...method import Method, frozen, seeded
+from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Share, Width, between
+from ...method import BaseConfig, Method, frozen, seeded
 from ...method.controls import Control, blend
 from ...readers.single_image import photograph
 from ...system.progress import track
@@ -48,7 +48,7 @@ PERCEPTUAL_WEIGHT = 10.0  # of the difference of features
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, as its published code has them (NVlabs/imaginaire, landscape.yaml and lhq.yaml)."""
 
     # Field
@@ -86,7 +86,6 @@ class Config:
     momentum: Annotated[float, between(0, 0.999)] = 0.0  # beta_1 of Adam
     painter_learning_rate: LearningRate = 1e-4  # of the painter of pseudo truth
     painter_adversary_learning_rate: LearningRate = 4e-4  # of the painter's adversary
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)

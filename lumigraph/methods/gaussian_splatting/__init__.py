@@ -16,8 +16,9 @@ from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
-from ...files.ranges import Seed, changed
+from ...files.ranges import changed
 from ...gaussians.splatting import render
+from ...method import BaseConfig
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
 from .instances import Identities, InstanceNumbers
@@ -35,7 +36,7 @@ POSE_LEARNING_RATE = 5e-3  # radians that a step moves a picture at most
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     cloud: CloudNumbers = CloudNumbers()
@@ -49,7 +50,6 @@ class Config:
     sparse: FewViewNumbers = FewViewNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     groups: InstanceNumbers = InstanceNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

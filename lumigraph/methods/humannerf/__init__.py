@@ -21,8 +21,8 @@ from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
-from ...files.ranges import Seed, changed
-from ...method import FieldMethod, Pass, seeded
+from ...files.ranges import changed
+from ...method import BaseConfig, FieldMethod, Pass, seeded
 from ...method.field import Colours, Densities, Directions, Points
 from ...method.sampler import Density
 from ...volume import composite
@@ -32,7 +32,7 @@ PROBED_MOMENTS = 8  # at which an update of the occupancy grid asks for density
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the release for ZJU-MoCap, chungyiweng/humannerf, configs/default.yaml."""
 
     backbone: BackboneNumbers = BackboneNumbers(
@@ -41,7 +41,6 @@ class Config:
     bones: BoneNumbers = BoneNumbers()
     weights: WeightNumbers = WeightNumbers()
     nonrigid: NonRigidNumbers = NonRigidNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class HumanNeRF(Articulated, FieldMethod):

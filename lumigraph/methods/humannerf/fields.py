@@ -53,7 +53,7 @@ class NonRigidOffset(Part):
         self.network = DeformationNetwork(n.nonrigid_frequencies, angles, *shape, 3)
         self.register_buffer("alpha", torch.tensor(OFF))
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         n = self.numbers
         grown = (progress - n.nonrigid_from) / max(n.nonrigid_until - n.nonrigid_from, 1e-9)
         self.alpha.fill_(min(grown, 1.0) * n.nonrigid_frequencies if grown >= 0 else OFF)

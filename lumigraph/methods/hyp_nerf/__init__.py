@@ -26,9 +26,9 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, Count, LearningRate, NonNegative, Positive, Share, Width, between
 from ...geometry import look_at, turning
-from ...method import Method, RayMethod, seeded
+from ...method import BaseConfig, Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.up import common_up
@@ -42,10 +42,11 @@ DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in
 
 HYPER_LAYERS = 2  # hidden layers of the hypernetwork for each tensor
 DENOISER_WIDTH = 32  # channels of the denoiser, section 3.3
+CODE_WEIGHT = 0.0  # of the codes' squares: an option of older runs, always off
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
 
     table: HashNumbers = HashNumbers(log2_hashmap_size=11)  # of an object
@@ -63,7 +64,6 @@ class Config:
     targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that a step's rays come from
     empty_points: Tally = 1024  # random points of a member in empty space, for empty_weight; 0: no such term
     empty_weight: NonNegative = 0.01  # weight of density in known empty space; higher removes floating density
-    code_weight: NonNegative = 0.0  # weight of the codes' squares in the loss; higher keeps codes near zero
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
@@ -73,7 +73,6 @@ class Config:
     tune_steps: Tally = 60  # steps that tune the field to the photographs, section 3.3; 0: code alone
     denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)
@@ -224,8 +223,7 @@ class HypNeRF(RayMethod):
     def loss(self, batch: InstanceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of colours of all members (eq. 2), density in empty space, and the denoiser's error."""
         generator, share = self.random(step), 1 / len(batch.members)
-        codes = self.codes(torch.tensor(batch.members, device=self.device))
-        instances = self._made(codes)
+        instances = self._made(self.codes(torch.tensor(batch.members, device=self.device)))
         terms: dict[str, Tensor] = {}
         mse = 0.0
         for instance, evidence in zip(instances, batch.evidence, strict=True):
@@ -233,8 +231,6 @@ class HypNeRF(RayMethod):
                 terms[name] = terms.get(name, 0.0) + share * term
             mse += share * self.figures["mse"]
         self.figures["mse"] = mse
-        if self.config.code_weight:
-            terms["code"] = self.config.code_weight * codes.square().mean()
         if self._denoising:
             terms["denoiser"] = self._denoiser_error(batch, instances[-1])
         return terms

@@ -22,8 +22,8 @@ from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINT
 from ...components.tracking.trajectory import Pose, apply_twists
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import BatchSize, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
-from ...method import FieldMethod, Pass, frozen, seeded
+from ...files.ranges import BatchSize, Layers, LearningRate, NonNegative, Positive, Share, Width, between, changed
+from ...method import BaseConfig, FieldMethod, Pass, frozen, seeded
 from ...method.method import Descend
 from ...volume import composite
 from .fields import DistanceTable, MapNetwork
@@ -78,7 +78,7 @@ LAYERS = 4  # hidden layers of the network, section 3.1
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, by section; those without one are not in the paper."""
 
     table: HashNumbers = HashNumbers(sh_bands=1)
@@ -94,7 +94,6 @@ class Config:
     truncation: Positive = 0.1  # metres at which the distance is truncated, with --field hash
     sharpness: Positive = 10.0  # steepness of density at a surface, per truncation, with --field hash
     learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class IMap(FieldMethod):

@@ -25,16 +25,18 @@ from ...datasets.mesh import Mesh
 from ...datasets.scene import Frame, Photograph, Scene
 from ...depth_maps import TSDF, Tolerance, fused_colours, render_depth_maps
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, Seed, Share, between
-from ...method import Method
+from ...files.ranges import LearningRate, NonNegative, Share, between
+from ...method import BaseConfig, Method
 from ...method.capabilities import HasMesh, can, needs
 from ...system.work import at_work
 from .optimizer import UniformAdam
 from .surface import MeshSurface, face_normals, remeshed, vertex_normals
 
+MASK_WEIGHT = 1.0  # weight of the silhouettes' absolute error
+
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Numbers of the paper's experiments; colours and weights of terms are ours, for it fits to shaded pictures."""
 
     start: Literal["sphere", "hull"] = "sphere"  # first mesh: a sphere, or the hull of the photographs' silhouettes
@@ -47,10 +49,8 @@ class Config:
     remeshings: Annotated[int, between(0, 20)] = 2  # from the first to the last; 0 keeps the first triangles
     remeshing_until: Share = 0.6  # share of the budget in which they happen
     views_per_step: Annotated[int, between(1, 64)] = 8  # photographs of a step; more are steadier, and cost time
-    mask_weight: NonNegative = 1.0  # of the silhouettes' absolute error
     laplacian_weight: NonNegative = 0.0  # of |L x|^2 over squared edges; larger is smoother
     normal_weight: NonNegative = 0.0  # of 1 - cosine between neighbours' normals; larger is flatter
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -166,7 +166,7 @@ class MeshFit(Method):
                 silhouette.append((off if photograph.mask is None else off[photograph.mask]).mean())
         terms = {"colour": torch.stack(colour).mean()}
         if silhouette:
-            terms["mask"] = c.mask_weight * torch.stack(silhouette).mean()
+            terms["mask"] = MASK_WEIGHT * torch.stack(silhouette).mean()
         if c.laplacian_weight:
             terms["laplacian"] = c.laplacian_weight * surface.roughness(vertices)
         if c.normal_weight:

@@ -35,14 +35,13 @@ from ...files.ranges import (
     LearningRate,
     NonNegative,
     PositiveShare,
-    Seed,
     Share,
     Width,
     between,
 )
 from ...geometry import unit
 from ...light import SUFFIXES, EnvironmentLight, directions, solid_angles
-from ...method import FieldMethod, seeded
+from ...method import BaseConfig, FieldMethod, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -69,7 +68,7 @@ PROPERTY_WIDTH = 128  # width of a property's network, section 3
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's and its release's parameters (nerfactor.ini, shape.ini, brdf.ini), with a hash table for the NeRF."""
 
     table: HashNumbers = HashNumbers()
@@ -92,7 +91,6 @@ class Config:
     geometry_rate: LearningRate = 1e-2  # learning rate of the geometry at first; higher: faster, may diverge
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of the geometry's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # residual of the geometry's loss at which it turns linear; 1: always squared
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 MIN_ALBEDO, ALBEDO_RANGE = 0.03, 0.77  # section 3.3

@@ -22,8 +22,8 @@ from ...components.sampling.samplers import sampling_bytes
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between, changed
-from ...method import FieldMethod, Pass, seeded
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Share, Width, between, changed
+from ...method import BaseConfig, FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
 from ...volume import composite, weights_of
@@ -61,7 +61,7 @@ class DeformationNumbers:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; `Nerfies.preset` has those of a plain CPU."""
 
     backbone: BackboneNumbers = BackboneNumbers(
@@ -74,7 +74,6 @@ class Config:
     table_annealing: Share = 0.0  # share of the budget in which levels of the hash table join; 0: at once
     appearance_code: Code = 8  # numbers of a photograph's appearance, section 3.1; 0: all have the same
     deformation_rate: PositiveShare = 1.0  # share of the learning rate that the deformation and its codes learn at
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Nerfies(FieldMethod):

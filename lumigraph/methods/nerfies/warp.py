@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -38,7 +38,7 @@ class MomentCodes(Part):
         self.register_buffer("moments", torch.linspace(*(frame.times or (0.0, 1.0)), rows))
         self.codes = nn.Parameter(FIRST_CODE * torch.rand(rows, width))
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         if data.cameras.time is not None:
             found = data.cameras.time[data.splits["train"]].unique()
             self.moments.fill_(math.inf)
@@ -79,7 +79,7 @@ class MotionField(Part):
         self.network = DeformationNetwork(bands, code, *shape, 6 if motion == "se3" else 3)
         self.register_buffer("alpha", torch.tensor(0.0))
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         self.alpha.fill_(self.bands * min(progress / self.annealing, 1.0) if self.annealing else self.bands)
 
     def forward(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"]) -> Float[Tensor, "point 3"]:

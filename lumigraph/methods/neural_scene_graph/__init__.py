@@ -27,8 +27,8 @@ from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
 from ...errors import LumigraphError
-from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
-from ...method import FieldMethod, Pass, frozen, seeded
+from ...files.ranges import NonNegative, PositiveShare, between, changed
+from ...method import BaseConfig, FieldMethod, Pass, frozen, seeded
 from ...method.controls import Control, Value, blend, moment
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -40,7 +40,7 @@ CODE_STEPS, CODE_RAYS, CODE_RATE = 200, 512, 2e-2  # of finding the codes of uns
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The release's numbers (example_configs/config_kitti_0006_example_train.txt); `preset` has a plain CPU's."""
 
     backbone: BackboneNumbers = BackboneNumbers()
@@ -56,7 +56,6 @@ class Config:
     pose_input: Literal["location", "heading"] = "location"  # of a box, that colour depends on besides the direction
     symmetric: bool = False  # left and right sides of boxes are alike, so that either one shows the other
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class NeuralSceneGraph(FieldMethod):

@@ -16,8 +16,8 @@ from ...components.sampling.sampling import stratified
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, LearningRate, RaySamples, Seed, Width, between
-from ...method import RayMethod, seeded
+from ...files.ranges import BatchSize, LearningRate, RaySamples, Width, between
+from ...method import BaseConfig, RayMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
@@ -34,7 +34,7 @@ SMOOTH_WEIGHT = 0.01  # of the total variation of log opacity, section 5.4
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; `NeuralVolumes.preset` has those of a plain CPU."""
 
     encoder_size: Side = 512  # pixels a side of those pictures, a power of two; larger ones cost memory and time
@@ -54,7 +54,6 @@ class Config:
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher: faster, may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for sides that halving does not lead to."""

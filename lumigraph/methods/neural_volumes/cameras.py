@@ -41,7 +41,7 @@ class Rig(Part):
         self.register_buffer("mean", torch.full((3,), 0.5))
         self.register_buffer("deviation", torch.tensor(1.0))
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         train = data.splits["train"]
         times = torch.zeros(len(data)) if data.cameras.time is None else data.cameras.time
         moments = times[train].unique()

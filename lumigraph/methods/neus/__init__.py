@@ -21,8 +21,8 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between, changed
-from ...method import FieldMethod, seeded
+from ...files.ranges import LearningRate, NonNegative, RaySamples, Share, Width, between, changed
+from ...method import BaseConfig, FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
 from .fields import COLOUR_DEPTH, DistanceNumbers, HashDistance, NetworkDistance, NeuSField
@@ -40,7 +40,7 @@ MASK_WEIGHT = 0.1  # beta, weight of the mask term, eq. 18, where photographs ha
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, from section E and the release (confs/wmask.conf, womask.conf)."""
 
     network: DistanceNumbers = DistanceNumbers()
@@ -61,7 +61,6 @@ class Config:
     final_learning_rate: LearningRate = 2.5e-5  # learning rate at the end of the budget, reached along a cosine
     sharpness_rate: Share = 1.0  # share of the learning rate that the inverse deviation s learns at
     warmup: Share = 1 / 60  # share of the budget in which the learning rate grows
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -143,7 +141,7 @@ class SectionSampler(Sampler):
         t[:, 0] = first
         return Samples.rows(t, last).keep((light > MIN_LIGHT).repeat_interleave(count))
 
-    def after_step(self, method: Any, step: int) -> None:
+    def after_step(self, method: object, step: int) -> None:
         """Set the next step's number of rays, as s grows and fewer sections of each matter."""
         if self.samples_per_step:
             rays, first = int(self.rays_per_step), self.numbers.rays_per_step

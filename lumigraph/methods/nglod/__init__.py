@@ -20,9 +20,9 @@ from ...components.training.shape_points import PointNumbers, PointPools
 from ...datasets.scene import Frame
 from ...datasets.shapes import PointBatch, Shapes
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, Seed, Width, between, changed
+from ...files.ranges import LearningRate, NonNegative, Width, between, changed
 from ...kernels.octree_cells import MAX_LEVELS, Crossed
-from ...method import seeded
+from ...method import BaseConfig, seeded
 from ...method.controls import Control
 from .loops import trace
 from .octree import CodeOctree
@@ -31,7 +31,7 @@ MAX_STEPS = 64  # steps of sphere tracing at most
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; where it leaves them open, those of the published code (sdf-net/lib/options.py)."""
 
     points: PointNumbers = PointNumbers(near_share=0.8, near_spread=0.01, fine_spread=0.0)
@@ -43,7 +43,6 @@ class Config:
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first
     final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
     hit_distance: NonNegative = 3e-4  # scene units from the surface at which a ray meets it; smaller costs steps
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for an octree deeper than rays can cross."""

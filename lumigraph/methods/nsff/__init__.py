@@ -18,8 +18,8 @@ from ...components.sampling.samplers import sampling_bytes
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
-from ...method import FieldMethod, seeded
+from ...files.ranges import NonNegative, PositiveShare, between, changed
+from ...method import BaseConfig, FieldMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Densities, Directions, Points
 from ...method.sampler import Density
@@ -53,14 +53,13 @@ class FlowNumbers:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; `NSFF.preset` has those of a plain CPU."""
 
     backbone: BackboneNumbers = BackboneNumbers(final_learning_rate=5e-6)
     rays: EvenNumbers = EvenNumbers()
     flow: FlowNumbers = FlowNumbers()
     static_field: bool = True  # a static field beside the dynamic one; off: the dynamic one shows everything
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Hop(NamedTuple):

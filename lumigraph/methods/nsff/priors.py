@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -60,7 +60,7 @@ class MotionPriors(Part):
         if self.source == "sweeps":
             compile_sweep()
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: object, data: Scene, seconds: float) -> None:
         train, cameras, device = data.splits["train"], data.cameras, self.row.device
         smaller = math.ceil(int(cameras.size.max()) / MAX_SIDE)
         pictures = {i: data.photograph(i).reduced(smaller) for i in train.tolist()}

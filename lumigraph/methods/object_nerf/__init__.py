@@ -41,9 +41,9 @@ from ...components.training.photometric import huber
 from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
+from ...files.ranges import NonNegative, PositiveShare, between, changed
 from ...geometry import Similarity
-from ...method import FieldMethod, seeded
+from ...method import BaseConfig, FieldMethod, seeded
 from ...method.controls import Control
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -51,7 +51,7 @@ from .fields import InstanceBoxes, ObjectTable, SceneWithout
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The numbers of the authors' release (zju3dv/object_nerf, config/); those of the paper have their section."""
 
     backbone: BackboneNumbers = BackboneNumbers(learning_rate=1e-3, final_learning_rate=1e-5)
@@ -61,7 +61,6 @@ class Config:
     guided: bool = True  # samples behind the scene's surface teach an object nothing, section 3.4; off: they do
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of both tables, towards a density of 1
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 OBJECT_LAYERS, OBJECT_WIDTH = 4, 128  # hidden layers of the object branch's network, and their channels

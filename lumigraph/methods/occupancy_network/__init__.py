@@ -23,8 +23,8 @@ from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
-from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between, changed
-from ...method import seeded
+from ...files.ranges import Count, Layers, LearningRate, Width, between, changed
+from ...method import BaseConfig, seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
 Input = Literal["points", "voxels", "picture"]
@@ -37,7 +37,7 @@ FINAL_LEARNING_RATE = 1e-4  # learning rate at the end of the budget, reached ex
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers; where it leaves them open, those of the published code (configs/)."""
 
     input: Input = "points"  # evidence that a shape is encoded from: a cloud of points, voxels, or one picture
@@ -57,7 +57,6 @@ class Config:
     points_per_shape: Annotated[int, between(1, 1 << 20)] = 2048  # points of each shape in a step, section 3.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first, appendix A
     code_steps: Annotated[int, between(0, 10_000)] = 0  # steps that fit an encoded cloud's code to it; many overfit
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 PLAIN_SHARE = 0.25  # share of members that stay as they are where the others are warped: their codes are kept

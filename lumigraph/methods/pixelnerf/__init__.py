@@ -32,12 +32,11 @@ from ...files.ranges import (
     NonNegative,
     Positive,
     RaySamples,
-    Seed,
     Share,
     Width,
     between,
 )
-from ...method import RayMethod
+from ...method import BaseConfig, RayMethod
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.views import spread_out
@@ -55,7 +54,7 @@ BFLOAT16 = True  # multiply in bfloat16 where the processor is fast at it
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers (appendix B), with where its published code gives them; below them what saves time."""
 
     hidden_width: Width = 512  # channels of the network's layers, appendix B.1; wider costs memory and time
@@ -79,7 +78,6 @@ class Config:
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     empty_threshold: Share = 0.0  # coarse opacity below which a ray has no fine pass; higher is faster
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

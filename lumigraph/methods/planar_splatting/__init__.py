@@ -22,9 +22,10 @@ from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, NonNegative, Seed, Share, between, changed
+from ...files.ranges import BatchSize, NonNegative, Share, between, changed
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
+from ...method import BaseConfig
 from ...method.depth import DepthNumbers
 from ...system.work import at_work
 from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patch_centres, single_view_error
@@ -59,7 +60,7 @@ class PlaneNumbers:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, those of 3D Gaussian Splatting where it gives none."""
 
     cloud: CloudNumbers = CloudNumbers()
@@ -68,7 +69,6 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     measured: DepthNumbers = DepthNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for patches without a middle."""

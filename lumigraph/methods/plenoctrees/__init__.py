@@ -28,13 +28,12 @@ from ...files.ranges import (
     BatchSize,
     LearningRate,
     NonNegative,
-    Seed,
     Share,
     Width,
     between,
     changed,
 )
-from ...method import Field, FieldMethod, Sampler, seeded
+from ...method import BaseConfig, Field, FieldMethod, Sampler, seeded
 from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, fill, met
@@ -49,7 +48,7 @@ WEIGHT_THRESHOLD = 1e-3  # least weight of a leaf on some ray, section 4.1
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` has those of a plain CPU."""
 
     table: TableNumbers = TableNumbers()
@@ -67,7 +66,6 @@ class Config:
     octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1, to a pixel's size at most
     leaf_points: Annotated[int, between(1, 4096)] = 256  # points of a leaf that are averaged, section 4.1
     rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 SKIP_LAYER = 5  # layer of the network whose activation the input is concatenated to again

@@ -23,10 +23,10 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between, changed
+from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, Share, Steps, between, changed
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
-from ...method import Field, FieldMethod
+from ...method import BaseConfig, Field, FieldMethod
 from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
@@ -43,7 +43,7 @@ OPEN_TV_HARMONICS = 5e-3  # the same of harmonics where there is no bound
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers for synthetic scenes (section 3, and its release); `Plenoxels.preset` has a CPU's."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(
@@ -71,7 +71,6 @@ class Config:
     sparsity: NonNegative = 1e-11  # weight of the Cauchy loss of density, eq. 4; higher empties more
     beta: NonNegative = 0.0  # weight of the beta loss of opacity, eq. 5, for captures without alpha; 0: off
     exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where exposures are found to differ
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -35,14 +35,14 @@ from ...components.training.regularizers import (
 )
 from ...components.training.schedules import BandSchedule, falling, hold_and_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between, changed
-from ...method import FieldMethod, seeded
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between, changed
+from ...method import BaseConfig, FieldMethod, seeded
 from ...volume import composite
 from .patch_flow import SIDE, PatchFlow, backdrops
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The release's numbers for three photographs (configs/llff3.gin), with those of its flow ours and Instant-NGP's of
     the table; `RegNeRF.preset` has a CPU's."""
 
@@ -67,7 +67,6 @@ class Config:
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
     annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
     forward_annealing_start: PositiveShare = 1e-4  # share of forward-facing rays, from the far plane on, at first
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
     density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none

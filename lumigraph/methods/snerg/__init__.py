@@ -33,7 +33,6 @@ from ...files.ranges import (
     LearningRate,
     NonNegative,
     PositiveShare,
-    Seed,
     Share,
     Width,
     between,
@@ -42,7 +41,7 @@ from ...files.ranges import (
 from ...geometry import unit
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.spherical_harmonics import K00
-from ...method import FieldMethod, Pass, seeded
+from ...method import BaseConfig, FieldMethod, Pass, seeded
 from ...method.capabilities import HasField, can
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
@@ -53,7 +52,7 @@ POSITION_FREQUENCIES = 10  # octaves of positions of the network
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, with where it or its release gives them; `SNeRG.preset` has those of a plain CPU."""
 
     table: TableNumbers = TableNumbers()
@@ -81,7 +80,6 @@ class Config:
     # Of the paper's network.
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 FIELD, VOXELS, ATLAS = 0, 1, 2  # stages

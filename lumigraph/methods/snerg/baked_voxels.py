@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -197,7 +197,7 @@ class VisibilityGrid(Part):
         cells = self.cells(points[inside])
         self.weight.view(-1).scatter_reduce_(0, cells, weights[inside].detach(), "amax")
 
-    def before_step(self, method: Any, step: int, progress: float) -> None:
+    def before_step(self, method: object, step: int, progress: float) -> None:
         if step % self.interval == 0:
             self.weight *= DECAY
 

@@ -21,8 +21,8 @@ from ...components.fields.kept_photographs import Kept, chance, photographed, ra
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Seed, Share, Width, between
-from ...method import Method, RayMethod, seeded
+from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Share, Width, between
+from ...method import BaseConfig, Method, RayMethod, seeded
 from ...method.controls import Control, Value
 from .networks import Layer, RayMarcher, SceneHyperNetwork, perceptron, scene_features
 
@@ -38,7 +38,7 @@ CODE_LEARNING_RATE = 1e-2  # Adam's learning rate of that fit
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The paper's numbers, as its published code has them (srns.py, train.py)."""
 
     code: Width = 256  # numbers of a scene's code; more hold more scenes
@@ -58,7 +58,6 @@ class Config:
     # Finding the code of one scene.
     code_steps: Annotated[int, between(0, 100_000)] = 1000  # steps that fit the code of a new scene; more take longer
     fit_rays: BatchSize = 1024  # rays of a step of that fit; more reduce noise, and cost time
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,10 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Seed, Share, Steps, Width, between, changed
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Share, Steps, Width, between, changed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
-from ...method import Field, FieldMethod, seeded
+from ...method import BaseConfig, Field, FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -49,7 +49,7 @@ FINAL_LEARNING_RATE = 2e-3  # rate of planes and lines at the end of the budget;
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """VM-192 as the paper and its code for Blender's scenes have it; `TensoRF.preset` says what a plain CPU does."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20, occupancy_threshold=0.005)
@@ -73,7 +73,6 @@ class Config:
     final_l1_weight: NonNegative = 4e-5  # the same once the box has shrunk, the code's
     tv_interval: Steps = 1  # steps between these terms, whose weight is multiplied by it; more are faster
     learning_rate: LearningRate = 0.02  # rate of planes and lines until the last upsampling, section 5
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

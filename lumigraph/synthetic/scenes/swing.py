@@ -33,7 +33,7 @@ def still() -> tuple[Object, ...]:
 
 
 def angle(time: float) -> float:
-    """Degrees from the vertical, towards +x: half a period, from -WIDEST at time 0 to WIDEST at time 1."""
+    """Degrees from the vertical, towards +x: half a period, from -MAX_ANGLE at time 0 to MAX_ANGLE at time 1."""
     return -MAX_ANGLE * math.cos(math.pi * time)
 
 
