@@ -117,8 +117,8 @@ class DepthFrame:
         near = seen & (ahead.abs() < off)
         away = ((self.rgb[pixels] - other.rgb[place]) @ self.rgb.new_tensor(GREY)).abs()
         error = torch.where(near, away, MISSED)[seen].mean() if seen.any() else math.inf
-        common, close, front = (float(x.float().mean()) for x in (seen, near, seen & (ahead >= off)))
-        return Comparison(common, close, front, float(error))
+        common, on_it, front = (float(x.float().mean()) for x in (seen, near, seen & (ahead >= off)))
+        return Comparison(common, on_it, front, float(error))
 
     def sample_pixels(self, count: int, generator: torch.Generator, measured: bool = False) -> Int[Tensor, " chosen"]:
         """Random pixels; with `measured`, among those with depth."""
