@@ -59,7 +59,9 @@ def main(options: Options) -> None:
     for row in rows:
         print(json.dumps(row))
     if options.publish:
-        words = f"--scenes {' '.join(dict.fromkeys(row['scene'] for row in rows))} --methods {' '.join(options.methods)} "
+        words = (
+            f"--scenes {' '.join(dict.fromkeys(row['scene'] for row in rows))} --methods {' '.join(options.methods)} "
+        )
         words += f"--seconds {' '.join(f'{x:g}' for x in options.seconds)} --seeds {' '.join(map(str, options.seeds))}"
         about = {"commit": options.commit, "machine": rows[0]["trained_on"], "cells": rows}
         about["commands"] = [f"python benchmarks/one_minute.py DATA OUTPUT {words}"]
