@@ -59,11 +59,15 @@ def main(options: Options) -> None:
     for row in rows:
         print(json.dumps(row))
     if options.publish:
-        words = f"--seconds {' '.join(f'{x:g}' for x in options.seconds)} --seeds {' '.join(map(str, options.seeds))}"
+        words = (
+            f"--scenes {' '.join(dict.fromkeys(row['scene'] for row in rows))} --methods {' '.join(options.methods)} "
+        )
+        words += f"--seconds {' '.join(f'{x:g}' for x in options.seconds)} --seeds {' '.join(map(str, options.seeds))}"
         about = {"commit": options.commit, "machine": rows[0]["trained_on"], "cells": rows}
         about["commands"] = [f"python benchmarks/one_minute.py DATA OUTPUT {words}"]
         RESULTS.write_text(json.dumps(about, indent=1) + "\n", "utf-8")
-        write_bytes(CHART, standalone(chart(rows)), ours=True)
+        if len(options.seconds) > 1:
+            write_bytes(CHART, standalone(chart(rows)), ours=True)
 
 
 def measured(output: Path) -> list[Row]:

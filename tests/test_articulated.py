@@ -17,6 +17,7 @@ from budgets import budget
 from scipy.interpolate import make_smoothing_spline
 
 from lumigraph.camera import Camera
+from lumigraph.components.skinning import bone_motion
 from lumigraph.components.skinning.bone_motion import (
     BoneMotion,
     BoneNumbers,
@@ -128,8 +129,9 @@ def test_motion_of_too_few_moments_is_no_error():
     assert not torch.equal(found[:, 0], noisy[:, 0]) and torch.equal(found[:, 1], noisy[:, 1])
 
 
-def test_smooth_poses_begin_a_run_and_are_kept():
+def test_smooth_poses_begin_a_run_and_are_kept(monkeypatch):
     """Smoothing changes moments of photographs alone."""
+    monkeypatch.setattr(bone_motion, "warn_of_background", lambda data: None)
     angles = BEND * torch.tensor([0.0, 0.2, 0.1, 0.3, 0.2, 0.4, 0.3, 0.5])
     moving = replace(
         skeleton(), times=tuple(map(float, range(8))), poses=tuple(BonePose.of(bent(float(a))) for a in angles)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .atomic import explained
+from .atomic import explained, is_file
 
 SPLATS = "convert it to .ply with the program that wrote it, SuperSplat or splat-transform"
 MESH = "export it as .glb or .obj, for instance from Blender"
@@ -58,7 +58,7 @@ def about_file(path: Path) -> str | None:
 def about_poses(folder: Path) -> str | None:
     """Sentence on poses of another program in a folder or in its images, with the way out; None without any."""
     for pattern, (word, program, remedy) in POSES.items():
-        for file in (x for place in (folder, folder / "images") for x in place.glob(pattern)):
+        for file in (x for place in (folder, folder / "images") for x in place.glob(pattern) if is_file(x)):
             with explained(file), open(file, "rb") as opened:
                 if word.encode() in opened.read(PROBED_BYTES):
                     return (

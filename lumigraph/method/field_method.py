@@ -89,6 +89,11 @@ class FieldMethod(RayMethod, ABC):
         """Density for the sampler's grid and its loss terms, over all codes that rays may have."""
         return self.density
 
+    def random_times(self, points: Points, generator: torch.Generator) -> Float[Tensor, " point"]:
+        """A random moment of the capture for each point."""
+        first, last = self.frame.times or (0.0, 0.0)
+        return first + (last - first) * torch.rand(len(points), generator=generator).to(self.device)
+
     def rays_in_a_step(self, data: Scene) -> float:
         return self.sampler.expected_rays
 

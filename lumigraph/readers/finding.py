@@ -46,9 +46,9 @@ def find_named(folder: Path, name: str) -> Path:
                 if (other := in_other_form(place, end, form)) is not None:
                     return other
     if "\ufffd" in name:
-        form = re.compile(LOST.sub(".+", re.escape(parts[-1])))
-        found = {x.resolve() for place in places for x in place.iterdir() if form.fullmatch(x.name) and is_file(x)}
-        return found.pop() if len(found) == 1 else exact
+        alike = re.compile(LOST.sub(".+", re.escape(parts[-1])))
+        files = {x.resolve() for place in places for x in place.iterdir() if alike.fullmatch(x.name) and is_file(x)}
+        return files.pop() if len(files) == 1 else exact
     return exact
 
 

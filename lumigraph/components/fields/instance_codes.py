@@ -68,10 +68,10 @@ class InstanceCodes(nn.Module):
         axes = self.axes
         return (code - self.average) @ axes.T / axes.square().sum(-1)
 
-    def draw_code(self, generator: torch.Generator) -> Float[Tensor, " code"]:
+    def draw_code(self, seed: int) -> Float[Tensor, " code"]:
         """Random code from the Gaussian fitted to the trained codes."""
         axes = self.axes
-        return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
+        return self.average + torch.randn(len(axes), generator=torch.Generator().manual_seed(seed)).to(axes) @ axes
 
     def code_of(self, value: str, found: Float[Tensor, "found code"] | None = None) -> Float[Tensor, " code"]:
         """Code of a control's value: a member's, the average, that of evidence, or an interpolation of two, parsed by

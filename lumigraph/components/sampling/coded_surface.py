@@ -71,7 +71,7 @@ class CodedSurface(SurfaceMethod):
     def draw_object(self, seed: int) -> Method:
         """The method with a generated shape: a code sampled from the Gaussian of the trained ones."""
         told: Any = self.given()
-        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
+        told._show(self.codes.draw_code(seed))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:

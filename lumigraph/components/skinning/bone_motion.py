@@ -246,9 +246,8 @@ def warn_of_background(data: Scene) -> None:
     """Warn of photographs with a background, which no bone moves and no body shows."""
     for index in evenly(data.splits["train"].tolist(), CHECKED_PHOTOGRAPHS):
         shot = data.photograph(index)
-        seen = (shot.before(data.frame.background) - torch.tensor(data.frame.background)).abs().amax(
-            -1
-        ) > BACKGROUND_DIFFERENCE
+        away = (shot.before(data.frame.background) - torch.tensor(data.frame.background)).abs().amax(-1)
+        seen = away > BACKGROUND_DIFFERENCE
         edge = torch.ones_like(seen)
         edge[2:-2, 2:-2] = False
         if shot.mask is None and float(seen[edge].float().mean()) > MIN_BACKGROUND:

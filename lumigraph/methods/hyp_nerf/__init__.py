@@ -347,7 +347,7 @@ class HypNeRF(RayMethod):
     def draw_object(self, seed: int) -> Method:
         """A random object: a code from the Gaussian fitted to the trained codes."""
         told: Any = self.given()
-        told.found, told._shown = Kept(self.codes.draw_code(torch.Generator().manual_seed(seed))[None]), None
+        told.found, told._shown = Kept(self.codes.draw_code(seed)[None]), None
         told.tuned = untuned(self.shape)
         told.settings.pop("instance", None)
         return told

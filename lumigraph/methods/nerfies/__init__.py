@@ -148,11 +148,10 @@ class Nerfies(FieldMethod):
 
     def density_in_training(self, generator: torch.Generator) -> Density:
         """Density of each point at a random moment."""
-        first, last = self.frame.times or (0.0, 0.0)
 
         def density(points: Points) -> Densities:
-            times = first + (last - first) * torch.rand(len(points), generator=generator).to(self.device)
-            return self.network.density(points, pad(self.moment_codes(times), (self.network.appearance, 0)))
+            codes = self.moment_codes(self.random_times(points, generator))
+            return self.network.density(points, pad(codes, (self.network.appearance, 0)))
 
         return density
 

@@ -145,13 +145,7 @@ class NSFF(FieldMethod):
 
     def density_in_training(self, generator: torch.Generator) -> Density:
         """Density of each point at a random moment."""
-        first, last = self.frame.times or (0.0, 0.0)
-
-        def density(points: Points) -> Densities:
-            times = first + (last - first) * torch.rand(len(points), generator=generator).to(self.device)
-            return self.network.density(points, self.code_at(times))
-
-        return density
+        return lambda points: self.network.density(points, self.code_at(self.random_times(points, generator)))
 
     # Learning
 

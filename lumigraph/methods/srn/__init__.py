@@ -242,7 +242,7 @@ class SRN(RayMethod):
     def draw_object(self, seed: int) -> Method:
         """A random scene: a code from the Gaussian fitted to the trained codes."""
         told: Any = self.given()
-        told._show(self.codes.draw_code(torch.Generator().manual_seed(seed)))
+        told._show(self.codes.draw_code(seed))
         return told
 
     def _show(self, code: Float[Tensor, " code"]) -> None:

@@ -185,9 +185,9 @@ def walk(
 
     work: a folder to leave out; list_entries: lists the entries of a folder; seen: folders entered so far
     """
-    seen = {folder.resolve()} if seen is None else seen
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
+    seen = {folder.resolve()} if entries and seen is None else seen or set()
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
     masks = {name for entry in entries for name in names_beside(entry.stem)}
     for entry in entries:
