@@ -23,6 +23,7 @@ from .trajectory import CONTRADICTED, KNOWN, LOST, UNEXPLAINED, UNMEASURED, Pose
 
 Iterations = Annotated[int, between(0, 10_000)]
 MAX_STEP = 0.4, 0.6  # metres and radians between frames that tracking believes
+SLID_ERROR = 0.85  # of the error of an aligned pose, below which the one by features is better
 MIN_MATCHES = 10  # features whose points agree on a frame's pose
 FAST = 0.02, 0.026  # metres and radians a frame, above which tracking begins with features
 MAX_MOTION = 0.05, 0.053  # metres and radians a frame, above which a warning is given
@@ -191,13 +192,12 @@ class Tracker(Part):
                 yield found.to(self.trajectory.poses)
 
     def closest_first(self, frame: DepthFrame, poses: list[Pose], data: Scene, last: int) -> list[Pose]:
-        """Poses by their error of colours and depth against the last known frame and the latest keyframe, which the map
-        does not spoil: before a bare wall a map lets a pose slide."""
+        """A pose aligned with the map and the one by features; the latter first where its error against the last known
+        frame and the latest keyframe is clearly smaller: before a bare wall a map lets a pose slide."""
         others = [self.frame(data, i) for i in dict.fromkeys([last, *self.keyframes[-1:]])]
-        errors = [
-            sum(frame.compared(x, motion(self.trajectory.poses[x.index], p)).error for x in others) for p in poses
-        ]
-        return [poses[i] for i in sorted(range(len(poses)), key=errors.__getitem__)]
+        at = {x.index: self.trajectory.poses[x.index] for x in others}
+        aligned, own = (sum(frame.compared(x, motion(at[x.index], p)).error for x in others) for p in poses)
+        return poses if own >= SLID_ERROR * aligned else poses[::-1]
 
     @torch.no_grad()
     def agrees(self, frame: DepthFrame, pose: Pose, data: Scene, last: int) -> bool:
