@@ -33,6 +33,7 @@ from lumigraph.camera.lens import (
     OmnidirectionalStereo,
     OpenCV,
     Pinhole,
+    RadialThinPrism,
     ThinPrism,
 )
 from lumigraph.camera.rays import Rays, Rendering
@@ -329,6 +330,9 @@ def lens_of(kind: str) -> tuple[Lens, tuple[int, int]]:
         "opencv": OpenCV(focal, centre, torch.tensor([[-0.1, 0.02, 1e-3, -1e-3, 0, 0, 0, 0]])),
         "fisheye": Fisheye(focal / 3, centre, torch.tensor([[0.05, 0, 0, 0]])),
         "thinprism": ThinPrism(focal / 3, centre, torch.tensor([[0.05, 0, 0, 0, 1e-3, -1e-3, 1e-3, 0]])),
+        "radialthinprism": RadialThinPrism(
+            focal / 3, centre, torch.tensor([[0.05, *[0] * 5, 1e-3, -1e-3, 1e-3, *[0] * 3]])
+        ),
         "fieldofview": FieldOfView(focal, centre, torch.tensor([[0.8]])),
         "division": Division(focal, centre, torch.tensor([[-0.1]])),
         "equirectangular": Equirectangular(whole),

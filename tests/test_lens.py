@@ -21,6 +21,7 @@ from lumigraph.camera.lens import (
     OmnidirectionalStereo,
     OpenCV,
     Pinhole,
+    RadialThinPrism,
     ThinPrism,
     stretch,
 )
@@ -57,6 +58,9 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
     if kind == "thin prism":
         spread = torch.tensor([0.05, 0.01, 0.004, 0.001, 5e-3, 5e-3, 5e-3, 5e-3])
         return ThinPrism(focal, centre, spread * uniform(generator, -1, 1, CAMERAS, 8)), size
+    if kind == "radial thin prism":
+        spread = torch.tensor([0.05, 0.01, 0.004, 0.001, 2e-4, 1e-5, 5e-3, 5e-3, 5e-3, 1e-3, 5e-3, 1e-3])
+        return RadialThinPrism(focal, centre, spread * uniform(generator, -1, 1, CAMERAS, 12)), size
     if kind == "field of view":
         return FieldOfView(focal, centre, uniform(generator, 0, 1.2, CAMERAS, 1)), size
     if kind == "division":
@@ -70,7 +74,18 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
 
 
 SPHERES = ["equirectangular", "part of a sphere", "stereo"]
-KINDS = ["pinhole", "opencv", "fox", "fisheye", "wide fisheye", "thin prism", "field of view", "division", *SPHERES]
+KINDS = [
+    "pinhole",
+    "opencv",
+    "fox",
+    "fisheye",
+    "wide fisheye",
+    "thin prism",
+    "radial thin prism",
+    "field of view",
+    "division",
+    *SPHERES,
+]
 
 
 def random_pixels(size, generator):
@@ -171,6 +186,10 @@ def test_colmap_means_the_same(kind, model, generator):
     ("model", "parameters"),
     [
         ("THIN_PRISM_FISHEYE", [310, 300, 322, 241, 0.05, -0.02, 0.003, -0.002, 0.01, 0.001, 0.004, -0.003]),
+        (
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            [310, 300, 322, 241, -0.026, 0.095, -0.064, 9e-3, 3e-3, -6e-4, 1e-3, -2e-3, -3e-3, 1e-3, 2e-3, -1e-3],
+        ),
         ("FOV", [310, 300, 322, 241, 0.9]),
         ("FOV", [310, 300, 322, 241, 0.0]),
         ("DIVISION", [310, 300, 322, 241, -0.2]),

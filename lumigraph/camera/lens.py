@@ -274,9 +274,7 @@ class Fisheye(Lens):
     @cached_property
     def fold(self) -> Float[Tensor, "camera 1"]:
         """Angle from the axis up to which the distance from the centre is monotonic, at most pi."""
-        theta = torch.linspace(0, math.pi, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device)
-        distance, _ = stretch(theta, self.distortion.double().T[:, :, None].unbind())
-        return last_growing(theta, distance).to(self.focal.dtype)
+        return fisheye_fold(self.distortion)
 
     def unproject(self, pixels, index=None):
         target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
@@ -321,16 +319,17 @@ class ThinPrism(Fisheye):
     """
 
     distortion: Float[Tensor, "camera 8"]
+    radial_count = 4
 
     @cached_property
     def fold(self) -> Float[Tensor, "camera 1"]:
         """Angle from the axis up to which the radial part is monotonic."""
-        return Fisheye(self.focal, self.centre, self.distortion[:, :4]).fold
+        return fisheye_fold(self.distortion[:, : self.radial_count])
 
     def unproject(self, pixels, index=None):
         target_x, target_y = ((pixels - rows(self.centre, index)) / rows(self.focal, index)).unbind(-1)
         distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
-        x, y = straightened(target_x, target_y, limit, lambda x, y: prism(x, y, distortion))
+        x, y = straightened(target_x, target_y, limit, lambda x, y: self.distort(x, y, distortion))
         theta = torch.hypot(x, y)
         share = theta.sin() / theta.clamp_min(1e-12)
         return torch.stack([x * share, y * share, theta.cos()], -1)
@@ -339,11 +338,32 @@ class ThinPrism(Fisheye):
         away = points[:, :2].norm(dim=-1)
         theta = torch.atan2(away, points[:, 2])
         x, y = (points[:, :2] * (theta / away.clamp_min(1e-12))[:, None]).unbind(-1)
-        bent, _ = prism(x, y, columns(self.distortion, index))
+        bent, _ = self.distort(x, y, columns(self.distortion, index))
         valid = (theta <= rows(self.fold, index)[:, 0]) & ((away > 0) | (points[:, 2] > 0))
         return torch.stack(bent, -1) * rows(self.focal, index) + rows(self.centre, index), valid
 
+    def distort(self, x: Tensor, y: Tensor, distortion: Sequence[Tensor]) -> Distorted:
+        return prism(x, y, distortion)
+
     solid_angle = Lens.solid_angle
+
+
+@dataclass(frozen=True)
+class RadialThinPrism(ThinPrism):
+    """Fisheye lens of Project Aria (FisheyeRadTanThinPrism; COLMAP's RAD_TAN_THIN_PRISM_FISHEYE).
+
+    With (x, y) = theta (cos phi, sin phi) q(theta^2), q(s) = 1 + k1 s + ... + k6 s^6, and s = x^2 + y^2:
+
+        (x, y) -> (x, y) (1 + 2 (p1 x + p2 y)) + (p1 s + a s + b s^2, p2 s + c s + d s^2)
+
+    distortion: k1 ... k6 p1 p2 a b c d
+    """
+
+    distortion: Float[Tensor, "camera 12"]
+    radial_count = 6
+
+    def distort(self, x, y, distortion):
+        return radial_prism(x, y, distortion)
 
 
 @dataclass(frozen=True)
@@ -648,11 +668,33 @@ def prism(x: Tensor, y: Tensor, distortion: Sequence[Tensor]) -> Distorted:
     return bent, (xx, x * y * slope + down + 2 * a * y, x * y * slope + down + 2 * b * x, yy)
 
 
+def radial_prism(x: Tensor, y: Tensor, distortion: Sequence[Tensor]) -> Distorted:
+    """Distortion of RadialThinPrism."""
+    *radial, p1, p2, a, b, c, d = distortion
+    s = x * x + y * y
+    q = polynomial(s, 1, *radial)
+    slope = 2 * polynomial(s, *((i + 1) * k for i, k in enumerate(radial)))  # 2 dq/ds
+    u, v, uu, uv, vv = x * q, y * q, q + x * x * slope, x * y * slope, q + y * y * slope
+    s, along = u * u + v * v, 1 + 2 * (p1 * u + p2 * v)
+    right, down = 2 * (p1 + a + 2 * b * s), 2 * (p2 + c + 2 * d * s)
+    bent = u * along + (p1 + a + b * s) * s, v * along + (p2 + c + d * s) * s
+    xu, xv = along + (2 * p1 + right) * u, 2 * p2 * u + right * v
+    yu, yv = 2 * p1 * v + down * u, along + (2 * p2 + down) * v
+    return bent, (xu * uu + xv * uv, xu * uv + xv * vv, yu * uu + yv * uv, yu * uv + yv * vv)
+
+
 def stretch(theta: Tensor, distortion: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Distance from the fisheye's centre at each angle, and its derivative."""
-    k1, k2, k3, k4 = distortion
     s = theta * theta
-    return theta * polynomial(s, 1, k1, k2, k3, k4), polynomial(s, 1, 3 * k1, 5 * k2, 7 * k3, 9 * k4)
+    slopes = ((2 * i + 3) * k for i, k in enumerate(distortion))
+    return theta * polynomial(s, 1, *distortion), polynomial(s, 1, *slopes)
+
+
+def fisheye_fold(radial: Float[Tensor, "camera term"]) -> Float[Tensor, "camera 1"]:
+    """Angle from the axis up to which a fisheye's distance from the centre is monotonic, at most pi."""
+    theta = torch.linspace(0, math.pi, FOLD_SAMPLES, dtype=torch.float64, device=radial.device)
+    distance, _ = stretch(theta, radial.double().T[:, :, None].unbind())
+    return last_growing(theta, distance).to(radial.dtype)
 
 
 def last_growing(at: Float[Tensor, " sample"], values: Float[Tensor, "camera sample"]) -> Float[Tensor, "camera 1"]:

@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..camera.lens import Division, Equirectangular, FieldOfView, Fisheye, Lens, OpenCV, Pinhole, ThinPrism
+from ..camera.lens import (
+    Division,
+    Equirectangular,
+    FieldOfView,
+    Fisheye,
+    Lens,
+    OpenCV,
+    Pinhole,
+    RadialThinPrism,
+    ThinPrism,
+)
 from ..errors import LumigraphError
 from ..files import exists, explained, is_file, read_bytes, read_text
 from ..files.names import counted, natural
@@ -34,7 +44,12 @@ EXPECTED_FILES = {"COLMAP": ("sparse/0/cameras.*", "sparse/0/images.*")}
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
 PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-ONE_BEND = {"FOV": FieldOfView, "SIMPLE_DIVISION": Division, "DIVISION": Division}
+ALIKE = {  # lenses here that take COLMAP's coefficients in its order
+    "FOV": FieldOfView,
+    "SIMPLE_DIVISION": Division,
+    "DIVISION": Division,
+    "RAD_TAN_THIN_PRISM_FISHEYE": RadialThinPrism,
+}
 THIN_PRISM = "THIN_PRISM_FISHEYE"
 PRISM_ORDER = [0, 1, 4, 5, 2, 3, 6, 7]  # of its k1 k2 p1 p2 k3 k4 sx1 sy1, for the lens here
 FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
@@ -284,7 +299,7 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
         )
     if kind == "EQUIRECTANGULAR":
         return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
-    if kind not in (*PLANAR, *FISHEYE, *ONE_BEND, THIN_PRISM):
+    if kind not in (*PLANAR, *FISHEYE, *ALIKE, THIN_PRISM):
         raise LumigraphError(
             f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
             f"run COLMAP's image_undistorter and use its folder"
@@ -294,8 +309,8 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     focal = focal.expand(1, 2).contiguous()
     if kind == THIN_PRISM:
         return ThinPrism(focal, centre, bends[:, PRISM_ORDER])
-    if kind in ONE_BEND:
-        return ONE_BEND[kind](focal, centre, bends)
+    if kind in ALIKE:
+        return ALIKE[kind](focal, centre, bends)
     if kind in FISHEYE:
         return Fisheye(focal, centre, torch.nn.functional.pad(bends, (0, 4 - bends.shape[1])))
     if not bends.any():
