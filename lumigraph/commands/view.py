@@ -4,6 +4,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,7 +38,7 @@ class ViewCommand:
     def run(self) -> int:
         from ..export.loaded import Loaded
         from ..large import open_any
-        from ..viewer import Viewer, choose_address
+        from ..viewer import Viewer, at_free_address
         from .export_menu import export_menu
 
         loaded = Loaded.of(open_any(self.source), choose_device(self.device), self.settings)
@@ -47,8 +48,8 @@ class ViewCommand:
             behind=behind_of(opened, method, cameras),
             exporter=export_menu(opened, method, self.settings, self.device),
         )
-        address = choose_address(self.host, self.port, self.token)
-        with until_interrupted(), Viewer(method, subject, address) as viewer:
+        start = partial(Viewer, method, subject)
+        with until_interrupted(), at_free_address(self.host, self.port, self.token, start) as viewer:
             show_address(viewer, self.token)
             viewer.serve()
         return 0
@@ -131,13 +132,13 @@ def watching(command: Any, method: Any, data: Any, run: Any) -> Iterator[Any]:
     if not command.view:
         yield None
         return
-    from ..viewer import Viewer, choose_address
+    from ..viewer import Viewer, at_free_address
 
     subject = subject_of(run, finished=False)
     if run.photographed:
         subject = replace(subject, open_scene=lambda: data)
-    address = choose_address(command.host, command.port, command.token)
-    with Viewer(method, subject, address, training=True) as viewer:
+    start = partial(Viewer, method, subject, training=True)
+    with at_free_address(command.host, command.port, command.token, start) as viewer:
         show_address(viewer, command.token)
         yield viewer
 

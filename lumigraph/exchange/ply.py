@@ -101,6 +101,10 @@ def refuse_networks(path: Path, here: list[str]) -> None:
             f"{path} holds anchors of Scaffold-GS, whose Gaussians a network in its folder makes for each view; train "
             "on the photographs here, or export Gaussians there"
         )
+    if "beta" in here and any(name.startswith("sb_params") for name in here):
+        raise LumigraphError(
+            f"{path} holds kernels of Beta Splatting (Liu 2025), which are no Gaussians; train on the photographs here"
+        )
     if {"t", "scale_t"} <= {*here}:
         raise LumigraphError(
             f"{path} holds Gaussians in space and time (4D-GS), and all moments would be shown at once; export one "

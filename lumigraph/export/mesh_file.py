@@ -96,7 +96,7 @@ def write_mesh(
     encode = ENCODERS[ending(path, mesh.texture is not None)]
     upright = turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 1.0, 0.0])).numpy()
     parts = encode(MeshFile(path.stem, mesh, upright, lit, origin, pieces or {}))
-    written = [path.with_name(path.stem + end) if end else path for end in parts]
+    written = [path.with_name(unbroken(path.stem) + end) if end else path for end in parts]
     with counting(f"Writing {path.name}"):
         for file, data in zip(written, parts.values(), strict=True):
             write_bytes(file, data, "mesh")
@@ -116,7 +116,12 @@ def ending(path: Path, texture: bool = False) -> str:
 def files_of(path: Path, texture: bool) -> list[Path]:
     """All files written for a mesh of this name. Raises LumigraphError as `ending` does."""
     further = (MATERIAL, PICTURE, NORMALS) if texture and ending(path, texture) == ".obj" else ()
-    return [path, *(path.with_name(path.stem + end) for end in further)]
+    return [path, *(path.with_name(unbroken(path.stem) + end) for end in further)]
+
+
+def unbroken(name: str) -> str:
+    """A name that an .obj can state: many programs end it at the first blank."""
+    return "_".join(name.split())
 
 
 WITH_ORIGIN = ".ply", ".glb"  # endings of files that hold the frame's origin on Earth
@@ -157,18 +162,22 @@ def obj(file: MeshFile) -> Parts:
 
 def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
     """Text of an OBJ file, of its material, and their pictures. OBJ's v points upwards."""
-    held, numbers = io.StringIO(), np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
-    held.write(f"# written by Lumigraph\nmtllib {file.name}{MATERIAL}\nusemtl surface\n")
+    held, name, numbers = (
+        io.StringIO(),
+        unbroken(file.name),
+        np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9),
+    )
+    held.write(f"# written by Lumigraph\nmtllib {name}{MATERIAL}\nusemtl surface\n")
     np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g" if file.offset is None else "v %.14g %.14g %.14g")
     np.savetxt(held, texture.uv * [1, -1] + [0, 1], "vt %.7g %.7g")
     np.savetxt(held, file.normals, "vn %.5g %.5g %.5g")
     np.savetxt(held, numbers, "f " + " ".join(["%d/%d/%d"] * 3))
     colour = "Kd 1 1 1" if file.lit else "Kd 1 1 1\nKa 0 0 0\nillum 0"
-    lines = ["# written by Lumigraph", "newmtl surface", colour, f"map_Kd {file.name}{PICTURE}"]
+    lines = ["# written by Lumigraph", "newmtl surface", colour, f"map_Kd {name}{PICTURE}"]
     parts = {"": held.getvalue().encode(), MATERIAL: b"", PICTURE: png(texture.colours)}
     if texture.normals is not None:
         parts[NORMALS] = png(texture.normals, colours=False)
-        lines.append(f"norm {file.name}{NORMALS}")
+        lines.append(f"norm {name}{NORMALS}")
     return parts | {MATERIAL: "".join(line + "\n" for line in lines).encode()}
 
 

@@ -13,8 +13,12 @@ COLMAP_EXPORT = "export the cameras as COLMAP text beside the photographs"
 FILES = {  # by suffix: what a file is, the way out
     ".zip .tar .gz .tgz .7z .rar .xz .zst": ("an archive", "unpack it, and name the folder or the file in it"),
     ".ksplat .splatv .lcc .rad .spx .gsplat .psht .ssproj .sog4 .xgrids": ("a file of Gaussians", SPLATS),
-    ".fbx .dae .3ds .3mf .blend .abc .wrl .x3d .step .stp .iges .max .c4d .usd .usda .usdc .usdz": ("a mesh", MESH),
-    ".ckpt .pt .pth .safetensors .npz .pkl": ("a checkpoint or a table of numbers", "export a .ply or .glb from it"),
+    ".fbx .dae .3ds .3mf .blend .abc .wrl .x3d .step .stp .iges .max .c4d .usd .usda .usdc .usdz .drc .ifc .skp .lwo "
+    ".vtk .vtp .b3dm .mesh": ("a mesh", MESH),
+    ".ckpt .pt .pth .safetensors .npz .npy .pkl .h5 .hdf5": (
+        "a checkpoint or a table of numbers",
+        "export a .ply or .glb from it",
+    ),
     ".insv .360 .insp": ("a film or picture of two fisheye circles", SPHERE),
     ".r3d": ("a recording of Record3D", "export it there as RGBD (zip), unpack it, and name the folder"),
     ".bag .mcap .db3 .svo .svo2 .oni .klg": (
@@ -33,6 +37,11 @@ POSES = {  # by name in a folder: a word of its first kilobytes, whose poses, th
     "*.sfm": ("", "Meshroom", "add its node ConvertSfMFormat with COLMAP's output, and name that folder"),
     "sfm_data.json": ("", "OpenMVG", "run openMVG_main_openMVG2Colmap, and name its folder"),
     "reconstruction.json": ("", "OpenSfM (ODM, WebODM)", "run `opensfm export_colmap`, and name its folder"),
+    "sparse/0/images.*": (
+        "",
+        "COLMAP without its cameras",
+        "copy cameras, images and points3D there, all .bin or .txt",
+    ),
     "*.db": ("SQLite", "COLMAP, without a model", "run COLMAP's mapper, which writes sparse/0"),
     "meta_data.json": ("", "SDFStudio", "write transforms.json as nerfstudio does, from its camtoworld and intrinsics"),
     "*.json": ('"transform_matrix"', "instant-ngp or nerfstudio under another name", "name the file transforms.json"),

@@ -239,23 +239,27 @@ def check_text(path: Path) -> None:
 
 
 def read_binary_model(place: Path) -> pycolmap.Reconstruction:
-    """A binary model, also one without points, as exporters leave out what they do not have."""
+    """A binary model, also one without points, as exporters leave out what they do not have; and one whose rigs and
+    frames are those of another state, as programs leave them that know images alone. Each image has its pose."""
     if is_file(place / "points3D.bin"):
         read_points3d(place / "points3D.bin")
-        return pycolmap.Reconstruction(place)
+        with contextlib.suppress(IndexError, ValueError):
+            return pycolmap.Reconstruction(place)
     with tempfile.TemporaryDirectory() as whole:
-        for path in place.glob("*.bin"):
+        for path in (place / f"{name}.bin" for name in (*PARTS, "points3D") if is_file(place / f"{name}.bin")):
             (Path(whole) / path.name).symlink_to(path.resolve())
-        (Path(whole) / "points3D.bin").write_bytes(bytes(8))
+        if not is_file(place / "points3D.bin"):
+            (Path(whole) / "points3D.bin").write_bytes(bytes(8))
         return pycolmap.Reconstruction(whole)
 
 
 def read_text_model(place: Path) -> pycolmap.Reconstruction:
-    """A model as text. A name is the rest of its line, spaces and all, which pycolmap ends at the first."""
+    """A model as text, without rigs and frames, for each image has its pose. A name is the rest of its line, spaces and
+    all, which pycolmap ends at the first. A comma is a decimal point, as programs write it in some countries."""
     names: dict[str, str] = {}
     bare = False
     with tempfile.TemporaryDirectory() as plain:
-        for path in sorted(place.glob("*.txt")):
+        for path in (place / f"{name}.txt" for name in (*PARTS, "points3D") if is_file(place / f"{name}.txt")):
             lines = read_text(path).splitlines()
             for number in image_lines(lines) if path.name == "images.txt" else ():
                 *numbers, name = lines[number].split(maxsplit=IMAGE_WORDS - 1)
@@ -264,7 +268,7 @@ def read_text_model(place: Path) -> pycolmap.Reconstruction:
                 lines[number] = " ".join([*numbers, f"{number}.png"]) + ("" if has_features(lines, number) else "\n")
             if bare and path.name == "points3D.txt":  # tracks of features that are not there
                 lines = [" ".join(line.split()[:POINT_WORDS]) for line in lines if not line.startswith("#")]
-            (Path(plain) / path.name).write_text("\n".join(lines) + "\n\n")
+            (Path(plain) / path.name).write_text("\n".join(lines).replace(",", ".") + "\n\n")
         (Path(plain) / "points3D.txt").touch()
         model = pycolmap.Reconstruction(plain)
     for image in model.images.values():

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from ..errors import LumigraphWarning
 from ..files import is_file
 from .capture import Capture, PixelPlane, Shot
-from .pictures import find_file, list_images, stem
+from .pictures import find_file, stem
 
 MASKS, OBJECT_MASKS, LABELS = "masks", "object_masks", "labels"
 OTHER_MASKS = "mask", "matting", "segmentation"  # folders of silhouettes, or of the opposite, in other programs
@@ -41,8 +41,9 @@ def find_mask(folder: Path, name: str) -> Path | None:
     """Mask of a photograph in a folder of masks, or None."""
     if not folder.is_dir():
         return None
-    ends = (x for own in inner_names(name) for x in (own, stem(own), f"{stem(own)}_mask"))
-    return next((file for x in ends if is_file(file := find_file(folder / x))), None)
+    ends = [x for own in inner_names(name) for x in (own, stem(own), f"{stem(own)}_mask")]
+    files = (*(find_file(folder / x) for x in ends), *(folder / f"{x}.gif" for x in ends))
+    return next(filter(is_file, files), None)
 
 
 def inner_names(name: str) -> Iterator[str]:
@@ -64,6 +65,14 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
         text = (
             f"{other} is not used, for programs disagree on its meaning; put masks whose black pixels are ignored "
             f"into {folder / MASKS}, silhouettes into {folder / OBJECT_MASKS}"
+        )
+        capture = replace(capture, notes=[*capture.notes, text])
+    if (plane := next((folder / x for x in PLANES if (folder / x).is_dir()), None)) and not any(
+        x.planes for x in shots
+    ):
+        text = (
+            f"{plane} is not used, for nothing says its unit; name its files in {folder / 'transforms.json'}, as "
+            "depth_file_path with depth_unit_scale_factor, or as normals_file_path"
         )
         capture = replace(capture, notes=[*capture.notes, text])
     masks, silhouettes, labels = (in_any_case(folder, name) for name in (MASKS, OBJECT_MASKS, LABELS))
@@ -112,9 +121,9 @@ def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:
 
 
 def warn_unmatched(folder: Path, matched: bool) -> None:
-    if not matched and list_images(folder):
+    if not matched and (found := next((x for x in sorted(folder.rglob("*")) if x.is_file()), None)):
         text = (
-            f"None of the masks in {folder} is named after a photograph, so they are passed over; call them "
-            "image.png or image.jpg.png for image.jpg"
+            f"None of the masks in {folder}, such as {found.name}, is named after a photograph; they are passed over. "
+            "Call them image.png or image.jpg.png for image.jpg"
         )
         warnings.warn(text, LumigraphWarning, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..exchange.unpacked_gltf import plain
-from ..files import is_file
+from ..files import is_file, read_text
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
 from ..files.reading import reads
@@ -30,6 +31,7 @@ from .points import read_vertices
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 Z_UP_SUFFIXES = (".stl", ".off")  # by custom with +z up; the others have +y up
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
+OFF = re.compile("(ST)?(C)?(N)?(4)?OFF")
 MAX_COORDINATE, ZERO_EXTENT = 1e12, 1e-12  # units of a file, from its origin; largest extent that counts as zero
 POLYGONS = "vertex_indices", "vertex_index"  # names of lists of corners in PLY files
 NORMAL = ["nx", "ny", "nz"]
@@ -84,9 +86,14 @@ def read_mesh(path: Path) -> Mesh:
         loaded = trimesh.load(io.BytesIO(plain(path)), process=False, file_type="glb")
     elif suffix == ".ply" and not has_texture(path):
         loaded = read_ply(path)
+    elif suffix == ".off":
+        loaded = read_off(path)
     else:
         loaded = trimesh.load(path, process=False, file_type=suffix[1:], resolver=Beside(path))
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    parts = [part for part in parts if isinstance(part, trimesh.Trimesh | trimesh.PointCloud)]  # no lines
+    if suffix == ".stl":
+        parts = [with_colours(part, path) for part in parts]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not meshes and not clouds:
@@ -109,12 +116,15 @@ def read_mesh(path: Path) -> Mesh:
 
 @dataclass(frozen=True)
 class Beside:
-    """Files that an .obj names, wherever `find_named` finds them, options before the name passed over."""
+    """Files that an .obj names, wherever `find_named` finds them, options before the name passed over. Several
+    materials' files on one line are one."""
 
     path: Path
 
     def get(self, name: str) -> bytes:
         words = name.split()
+        if len(words) > 1 and all(word.lower().endswith(".mtl") for word in words):
+            return b"\n".join(self.get(word) for word in words)
         files = (find_named(self.path.parent, " ".join(words[i:])) for i in range(len(words)))
         if (found := next(filter(is_file, files), None)) is None:
             text = f"{self.path} names {name.strip()}, which is not beside it; its colours are left out"
@@ -148,6 +158,62 @@ def read_ply(path: Path) -> Any:
     triangles, face = fans(faces[name])
     face_colours = None if (found := ply_colours(faces)) is None else found[face]
     return trimesh.Trimesh(positions, triangles, face_colors=face_colours, vertex_colors=colours, process=False)
+
+
+def read_off(path: Path) -> Any:
+    """Triangles of an OFF file (Geomview), its points if it has none; with colours of corners or of polygons.
+
+    Letters of its first word name what follows a corner: a weight (4), normal (N), colour (C), texture (ST).
+    """
+    import trimesh
+
+    lines = [words for line in read_text(path).splitlines() if (words := line.partition("#")[0].split())]
+    kind = OFF.fullmatch(lines[0][0])
+    counts, *rows = [words for words in (lines[0][1:] if kind else lines[0], *lines[1:]) if words]
+    corners, polygons = int(counts[0]), int(counts[1])
+    if not 0 <= corners <= corners + polygons <= len(rows):
+        raise ValueError("it ends early")
+    table = np.array(rows[:corners], np.float64).reshape(corners, -1)
+    texture, _, normal, weight = kind.groups() if kind else (None,) * 4
+    positions = table[:, :3] / table[:, 3:4] if weight else table[:, :3]
+    before = 3 + bool(weight) + 3 * bool(normal)
+    colours = table[:, before : table.shape[1] - 2 * bool(texture)][:, :3]
+    colours = bytes_of(colours) if colours.shape[1] == 3 else None
+    faces, sizes = rows[corners : corners + polygons], [int(row[0]) for row in rows[corners : corners + polygons]]
+    cornered = np.empty(polygons, object)
+    cornered[:] = [np.array(row[1 : 1 + size], np.int64) for row, size in zip(faces, sizes, strict=True)]
+    triangles, face = fans(cornered)
+    if not len(triangles):
+        return trimesh.PointCloud(positions, colours)
+    behind = [row[1 + size :] for row, size in zip(faces, sizes, strict=True)]  # one number is of a table elsewhere
+    own, of_faces = [i for i, words in enumerate(behind) if len(words) >= 3], None
+    if own:
+        of_faces = np.full((polygons, 3), DEFAULT_GREY, np.uint8)
+        of_faces[own] = bytes_of(np.array([behind[i][:3] for i in own], np.float64))
+        of_faces = of_faces[face]
+    return trimesh.Trimesh(positions, triangles, face_colors=of_faces, vertex_colors=colours, process=False)
+
+
+def bytes_of(colours: Float[np.ndarray, "row 3"]) -> UInt8[np.ndarray, "row 3"]:
+    """Colours up to 255, or all up to 1."""
+    return (colours * (255 if colours.max(initial=0) <= 1 else 1)).round().clip(0, 255).astype(np.uint8)
+
+
+def with_colours(part: Any, path: Path) -> Any:
+    """Triangles of an STL file with the colours in their 16 spare bits, as VisCAM or, with COLOR= in the header,
+    Magics puts them there."""
+    spare = getattr(part, "face_attributes", {}).get("stl")
+    if spare is None:
+        return part
+    bits = np.asarray(spare, np.int64).reshape(-1)
+    _, magics, default = path.read_bytes()[:80].partition(b"COLOR=")
+    own = (bits >> 15 == (0 if magics else 1)) & (bits > 0)
+    if not magics and not own.any():
+        return part
+    channels = np.stack([bits >> shift & 31 for shift in ((0, 5, 10) if magics else (10, 5, 0))], -1)
+    others = [*default[:3]] if magics else [DEFAULT_GREY] * 3
+    part.visual.face_colors = np.where(own[:, None], np.rint(channels * 255 / 31), others).astype(np.uint8)
+    return part
 
 
 def fans(polygons: np.ndarray) -> tuple[Int[np.ndarray, "triangle 3"], Int[np.ndarray, " triangle"]]:

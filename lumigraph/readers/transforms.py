@@ -48,6 +48,7 @@ WITHOUT_EFFECT = (  # keys of other programs that describe how the file was made
     "from_na", "integer_id", "n_extra_learnable_dims", "n_frames", "offset", "orientation_override", "render_aabb",
     "sharpness", "white_transparent", "black_transparent", "mask_color", "fix_premult", "is_hdr", "train_file_names",
 )  # fmt: skip
+POINTS_BESIDE = "sparse_pc.ply", "points3D.ply", "init.ply"  # nerfstudio's and Brush's, in the frame of the poses
 FACTS = ("exposure", "boxes", "body")  # of a photograph
 BLENDER_EMPTY_DEPTHS = (1e10, 65504.0)  # depth that Blender writes for background pixels, in floats and in halves
 
@@ -161,6 +162,7 @@ def read(folder: Path) -> Capture:
     whole, plain = read_frames_file(path)
     splits = published_splits(whole)
     shots, missing = read_shots(path, plain)
+    shots, notes = once_each(shots, path)
     if splits:
         shots = [replace(shot, split=splits[shot.name]) for shot in shots if shot.name in splits]
         missing = [name for name in missing if name in splits]
@@ -172,10 +174,23 @@ def read(folder: Path) -> Capture:
         raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
     cloud = {} if points is None else vars(points)
     made = read_json(folder / RESULT_FILE, Made) if (folder / RESULT_FILE).is_file() else Made()
-    notes = [f"{folder}: {warning}" for warning in made.warnings if "folded" in warning] + about_dialect(path, plain)
+    notes += [f"{folder}: {warning}" for warning in made.warnings if "folded" in warning] + about_dialect(path, plain)
     return Capture(
         str(folder), shots, missing=missing, reach=reach, up=whole.up, origin=made.origin, notes=notes, **cloud
     )
+
+
+def once_each(shots: list[Shot], path: Path) -> tuple[list[Shot], list[str]]:
+    """The first frame of each file and moment, and a sentence on further ones."""
+    first: dict[tuple[str, float | None], Shot] = {}
+    for shot in shots:
+        first.setdefault((str(shot.image), shot.time), shot)
+    if not (more := len(shots) - len(first)):
+        return shots, []
+    double = next(a for a, b in zip(shots, [*first.values(), None], strict=False) if a is not b)
+    moved = any((shot.pose != first[str(shot.image), shot.time].pose).any() for shot in shots)
+    text = f"{path} lists {counted(more, 'photograph')} more than once, such as {double.name}; each counts once"
+    return [*first.values()], [text + (", with the first of its poses" if moved else "")]
 
 
 def about_dialect(path: Path, plain: Json) -> list[str]:
@@ -420,7 +435,8 @@ def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str
         missing.append(name)
     place = colmap.model_folder(folder)
     if place is None:
-        return None
+        beside = next(filter(is_file, (folder / x for x in POINTS_BESIDE)), None)
+        return None if beside is None else read_ply(beside)
     positions = {shot.name: shot.pose[:, 3] for shot in shots}
     model = colmap.read_model(place)
     poses = colmap.poses_of(model)

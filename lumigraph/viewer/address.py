@@ -4,12 +4,19 @@ import ipaddress
 import secrets
 import socket
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ..errors import LumigraphError, LumigraphWarning
 
 HOST, PORT = "127.0.0.1", 8080
+Server = TypeVar("Server")
 MAX_PORT_TRIES = 100  # ports after the usual one
+
+
+class PortTakenError(LumigraphError):
+    """A port that was free when it was chosen, and is in use when a server starts."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,17 @@ def choose_address(host: str = HOST, port: int | None = None, token: str = "") -
             stacklevel=2,
         )
     return address
+
+
+def at_free_address(host: str, port: int | None, token: str, start: Callable[[Address], Server]) -> Server:
+    """Start a server at an address of `choose_address`; at the next where another program takes the port meanwhile,
+    unless `port` names it. Raises LumigraphError as that does."""
+    while True:
+        try:
+            return start(choose_address(host, port, token))
+        except PortTakenError:
+            if port is not None:
+                raise
 
 
 def new_token() -> str:

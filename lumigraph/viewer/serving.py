@@ -17,8 +17,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from ..errors import LumigraphError
-from .address import Address
+from .address import Address, PortTakenError
 from .guard import MAX_MESSAGE_BYTES, Answers, Guard, understood
 
 PAGE = "scene.html"  # where a scene that browsers draw by themselves is
@@ -26,7 +25,7 @@ _patching = threading.Lock()
 
 
 def start_server(address: Address, title: str, page: Callable[[], bytes] | None = None) -> Any:
-    """Start viser's server at exactly this address. Raises LumigraphError if the port is no longer free.
+    """Start viser's server at exactly this address. Raises PortTakenError if the port is no longer free.
 
     page: makes the response at PAGE
     """
@@ -37,7 +36,7 @@ def start_server(address: Address, title: str, page: Callable[[], bytes] | None 
     if server.get_port() != address.port:
         with quiet():
             server.stop()
-        raise LumigraphError(f"Port {address.port} has just been taken; start the viewer again")
+        raise PortTakenError(f"Port {address.port} has just been taken; start the viewer again")
     server.request_share_url = lambda *_, **__: None  # viser would connect to the outside if a client requested it
     return server
 
