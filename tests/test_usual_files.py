@@ -6,6 +6,7 @@ import json
 import struct
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from ply_files import ply_file
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh, MeshTexture
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.exchange import read_gaussians
+from lumigraph.exchange import read_gaussians, read_moving, write_gaussians
 from lumigraph.export.mesh_file import files_of, write_mesh
+from lumigraph.gaussians import Gaussians
 from lumigraph.opening import open_dataset, read_capture
 from lumigraph.readers.meshes import read_mesh
 from lumigraph.viewer.address import Address, PortTakenError, at_free_address
@@ -257,6 +259,15 @@ def test_files_of_further_programs_are_named(tmp_path, name, capsys):
     (tmp_path / name).write_bytes(b"data")
     assert main(["info", str(tmp_path / name)]) == 2
     assert "export" in capsys.readouterr().err
+
+
+def test_a_clip_keeps_its_duration(tmp_path):
+    gaussians = Gaussians(*(torch.ones(5, *x) for x in ((3,), (4,), (3,), (), (1, 3))))
+    for i in range(6):
+        write_gaussians(tmp_path / "clip" / f"{i}.ply", replace(gaussians, means=gaussians.means + 0.1 * i))
+    for more, seconds in (([], 0.2), (["--duration", "2"], 2.0)):
+        assert main(["export", "splats", str(tmp_path / "clip"), str(tmp_path / "a.4dgs"), *more, "--overwrite"]) == 0
+        assert read_moving(tmp_path / "a.4dgs").duration == pytest.approx(seconds)
 
 
 def taken(times: int) -> Callable[[Address], Address]:

@@ -26,9 +26,9 @@ from ..method import Method
 from ..method.capabilities import HasGaussians, HasMovingGaussians, can, needs
 from ..paths import Surroundings
 from ..run import Opened
-from ..run.files import SplatFile
+from ..run.files import MovingFile, SplatFile
 from ..run.opened import at_one_moment, controlled
-from .options import Keeping, Scaling, SplatsOptions
+from .options import DURATION, Keeping, Scaling, SplatsOptions
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,10 @@ class Loaded:
         gaussians = needs(self.method, HasGaussians).gaussians()
         return gaussians[self.kept(gaussians, self.crop)]
 
-    def moving(self, duration: float) -> MovingGaussians:
-        """Moving Gaussians to keep, in the scene's frame. duration: seconds of the whole capture when it is played"""
+    def moving(self, duration: float | None) -> MovingGaussians:
+        """Moving Gaussians to keep, in the scene's frame. duration: seconds of the whole capture when played; None
+        keeps those of a file, and gives others DURATION"""
+        duration = duration or (self.opened.moving.duration if isinstance(self.opened, MovingFile) else DURATION)
         if can(self.method, HasMovingGaussians):
             moving = needs(self.method, HasMovingGaussians).moving(duration)
         else:

@@ -29,6 +29,7 @@ TEXTURED_FACES = 50_000  # triangles whose texture holds the finer detail
 AUTO = "auto"
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")  # of films
 MAX_FILM_SIZE, MAX_RAYS_SIZE = 1280, 640  # pixels by default, of Gaussians and of methods that cast rays
+DURATION, DURATION_TEXT = 3.0, "3, or that of a file that moves"  # seconds
 FILM_SIZES = f"that of the photographs, at most {MAX_FILM_SIZE}, and {MAX_RAYS_SIZE} for methods that cast rays"
 ORIGIN = "Write latitude and longitude of the frame's origin into the file, where they are known."
 OriginOption = Annotated[bool, arg(help=ORIGIN)]
@@ -300,7 +301,7 @@ class SplatsOptions:
     """Options of a file of Gaussians."""
 
     detail: OmitArgPrefixes[Levels] = Levels()
-    duration: Annotated[Seconds, option("SECONDS")] = 3.0
+    duration: Annotated[Seconds | None, option("SECONDS", DURATION_TEXT)] = None
     """With .4dgs: time that the whole capture takes when it is played; longer is slower."""
     spz_version: Literal["3", "4"] = "4"
     """With .spz: version of the format; more programs read 3."""
@@ -332,7 +333,7 @@ class PageOptions:
     """Highest degree of an octree's harmonics; a lower one makes a smaller page, with weaker reflections."""
     seconds: Annotated[Seconds, option("S")] = 30.0
     """Training time of the octree that a field is converted to, in seconds."""
-    duration: Annotated[Seconds, option("SECONDS")] = 3.0
+    duration: Annotated[Seconds | None, option("SECONDS", DURATION_TEXT)] = None
     """Time that a capture of moving splats takes when it is played; longer is slower."""
 
 
