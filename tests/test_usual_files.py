@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pycolmap
 import pytest
@@ -26,6 +27,7 @@ from lumigraph.export.mesh_file import files_of, write_mesh
 from lumigraph.gaussians import Gaussians
 from lumigraph.opening import open_dataset, read_capture
 from lumigraph.readers.meshes import read_mesh
+from lumigraph.sfm.photos import gather
 from lumigraph.viewer.address import Address, PortTakenError, at_free_address
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -148,6 +150,24 @@ def test_half_a_model_is_named(tiny, tmp_path, capsys):
     (tmp_path / "sparse" / "0" / "cameras.bin").unlink()
     assert main(["info", str(tmp_path)]) == 2
     assert "COLMAP without its cameras" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "form"), [("a.lrv", "mp4"), ("clip", "mp4"), ("a.gif", "gif")])
+def test_a_film_is_known_by_its_content(tmp_path, name, form):
+    picture = np.random.default_rng(0).integers(0, 255, (64, 96, 3), np.uint8)
+    with av.open(str(tmp_path / name), "w", format=form) as film:
+        stream = film.add_stream(*(("gif", 10) if form == "gif" else ("libx264", 10)))
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "rgb8" if form == "gif" else "yuv420p"
+        for i in range(8):
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.roll(picture, 4 * i, 1), format="rgb24")))
+        film.mux(stream.encode(None))
+    assert len(gather([tmp_path / name], tmp_path / "work", frames=4).photos) == 4
+
+
+def test_a_picture_of_an_unread_kind_is_no_film(tmp_path):
+    Image.fromarray(np.zeros((64, 96, 3), np.uint8)).save(tmp_path / "a.tga")
+    with pytest.raises(LumigraphError, match="its format is not read here"):
+        gather([tmp_path / "a.tga"], tmp_path / "work")
 
 
 # Meshes

@@ -142,6 +142,14 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS and path.is_file()
 
 
+def is_film(path: Path) -> bool:
+    """True if a file is a video, by its content; a picture of any kind is none."""
+    with contextlib.suppress(LumigraphError), container_of(path) as container:
+        track_of(path, container)
+        return not container.format.name.endswith(("_pipe", "image2"))
+    return False
+
+
 @contextlib.contextmanager
 def opened(path: Path, tags: Tags | None = None) -> Iterator[OpenedFilm]:
     """A film with pictures. Raises LumigraphError where there are none. tags: to be seen by; None: by its own"""

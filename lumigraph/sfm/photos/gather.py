@@ -25,7 +25,7 @@ from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, UNSEEN, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
-from .film import is_video, tags_of
+from .film import is_film, is_video, tags_of
 from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
 from .video import extract
@@ -47,7 +47,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     track:   progress display, as display.track
     Raises LumigraphError without any picture.
     """
-    films = [source for source in sources if is_video(source)] or lone_film(sources)
+    films = [source for source in sources if is_video(source)] or lone_film(sources) or unnamed_film(sources)
     if films and len(sources) > 1:
         raise LumigraphError(f"{films[0]} is a video among other things; name it alone, or photographs without it")
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
@@ -221,6 +221,13 @@ def lone_film(sources: Sequence[Path]) -> list[Path]:
             f"cameras filmed at once, add --moving"
         )
     return films
+
+
+def unnamed_film(sources: Sequence[Path]) -> list[Path]:
+    """The one file named, where it is a film whose ending says nothing, such as .lrv or .gif."""
+    path = sources[0]
+    known = len(sources) > 1 or not path.is_file() or path.suffix.lower() in PHOTOGRAPHS or is_raw(path)
+    return [path] if not known and is_film(path) else []
 
 
 def named_files(files: list[Path]) -> dict[str, Path]:
