@@ -48,8 +48,8 @@ class ViewCommand:
             behind=behind_of(opened, method, cameras),
             exporter=export_menu(opened, method, self.settings, self.device),
         )
-        start = partial(Viewer, method, subject)
-        with until_interrupted(), at_free_address(self.host, self.port, self.token, start) as viewer:
+        viewer = at_free_address(self.host, self.port, self.token, partial(Viewer, method, subject))
+        with until_interrupted(), viewer:
             show_address(viewer, self.token)
             viewer.serve()
         return 0
