@@ -103,6 +103,32 @@ def test_points_beside_a_json_start_the_scene(tiny, tmp_path, name):
     np.testing.assert_allclose(read_capture(tmp_path).points, tiny.points, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("values", "unit", "wanted"),
+    [(4000, None, None), (400, None, "0.01"), (4000, 1.0, "0.001"), (4.0, None, "1"), (4.0, 1.0, None)],
+)
+def test_depth_of_another_unit_than_the_points_is_named(tiny, tmp_path, values, unit, wanted):
+    """Millimetres are the convention of `depth_file_path`; poses and points are in metres, four from the cameras."""
+    write_ngp(tmp_path, tiny, **({} if unit is None else {"depth_unit_scale_factor": unit}))
+    trimesh.PointCloud(tiny.points, tiny.colours).export(tmp_path / "sparse_pc.ply")
+    whole = json.loads((tmp_path / "transforms.json").read_text())
+    suffix = ".npy" if isinstance(values, float) else ".png"
+    for i, frame in enumerate(whole["frames"]):
+        frame["depth_file_path"] = f"depth/{i}{suffix}"
+    (tmp_path / "transforms.json").write_text(json.dumps(whole))
+    (tmp_path / "depth").mkdir()
+    for i in range(len(whole["frames"])):
+        depth = np.full((HEIGHT, WIDTH), values, np.uint16 if suffix == ".png" else np.float32)
+        if suffix == ".png":
+            Image.fromarray(depth).save(tmp_path / "depth" / f"{i}.png")
+        else:
+            np.save(tmp_path / "depth" / f"{i}.npy", depth)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = [text for text in open_dataset(tmp_path).warnings if "distance of the sparse points" in text]
+    assert [text.split("should be ")[1].split()[0] for text in found] == ([wanted] if wanted else [])
+
+
 def as_text(folder: Path) -> Path:
     """The model of a capture as text alone."""
     place = folder / "sparse" / "0"

@@ -22,7 +22,7 @@ from ..files.names import counted, natural
 from ..files.ranges import typed
 from ..geometry import Similarity
 from ..system.progress import counting
-from .beside import make_about, make_layers
+from .beside import about_depth, make_about, make_layers
 from .bones import scene_skeleton
 from .capture import MAX_COORDINATE, Capture, Shot, checked_pose
 from .normalise import find_forward, find_place, similarity
@@ -77,7 +77,7 @@ def assemble(
         if extra is not None:
             typed(type(extra), asdict(extra), capture.source)
     capture, lost = without_stray_points(capture)
-    told += capture.notes + lost + oddities(capture, shots, poses)
+    told += capture.notes + lost + oddities(capture, shots, poses) + about_depth(capture)
     with counting("Looking at photographs", len(shots)) as done:
         chosen = in_parallel(lambda i: choose(shots[i], downscale), range(len(shots)), done)
     told += about_small(capture.source, chosen) if downscale else []

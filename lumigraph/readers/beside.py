@@ -27,6 +27,8 @@ from .numbers import kind_of, read_numbers
 from .pictures import HEIC_SUFFIXES, Chosen, read_image, readable, same_shape, stat
 
 EXPOSURE_SUFFIXES = (".jpg", ".jpeg", *HEIC_SUFFIXES)  # files with an exposure time
+UNIT_FACTORS = [10.0**power for power in (-3, -2, -1, 1, 2, 3)]  # between metres, centimetres and millimetres
+MIN_COMPARED = 10  # sparse points
 DEPTH_KINDS = ("distance", "z-depth")
 DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are drawn from at most, and points of each
 
@@ -157,6 +159,34 @@ def with_depth_points(capture: Capture) -> Capture:
         colours.append(read_image(shot.image[1], False, shot.size)[y, x, :3])
     points = np.concatenate(positions)
     return replace(capture, points=points, point_colours=np.concatenate(colours), sightings=np.full(len(points), 2))
+
+
+def about_depth(capture: Capture) -> list[str]:
+    """A sentence where the depth of a photograph and the sparse points that it shows are of different units."""
+    shot = next(
+        (x for x in capture.shots if x.size and (y := x.planes.get("depth")) and isinstance(y.values, Path)), None
+    )
+    if shot is None or shot.size is None or capture.points is None:
+        return []
+    try:
+        plane = settled(shot.planes["depth"], "depth")
+        stored = read_plane(plane, "depth", np.dtype(np.float64), shot.size, np.eye(3))
+    except LumigraphError:  # said where it is read
+        return []
+    points = torch.from_numpy((capture.points - shot.pose[:, 3]) @ shot.pose[:, :3]).float()
+    pixels, seen = shot.lens.project(points)
+    column, row = pixels.nan_to_num(-1).floor().long().unbind(-1)
+    inside = seen & (points[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < shot.size[0]) & (row < shot.size[1])
+    away = points[:, 2] if plane.encoding == "z-depth" else points.norm(dim=-1)
+    there = known(stored, plane.unknown, 1)[row[inside], column[inside]]
+    if there.sum() < MIN_COMPARED:
+        return []
+    times = float(np.median(plane.scale * stored[row[inside], column[inside]][there] / away[inside].numpy()[there]))
+    near = [x for x in UNIT_FACTORS if 0.5 < times / x < 2]
+    text = (
+        f"{shot.planes['depth'].values} is {times:.3g} times the distance of the sparse points that it shows; its unit"
+    )
+    return [f"{text} should be {plane.scale / x:g} of the poses' and not {plane.scale:g}" for x in near]
 
 
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
