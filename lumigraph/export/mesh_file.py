@@ -162,11 +162,8 @@ def obj(file: MeshFile) -> Parts:
 
 def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
     """Text of an OBJ file, of its material, and their pictures. OBJ's v points upwards."""
-    held, name, numbers = (
-        io.StringIO(),
-        unbroken(file.name),
-        np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9),
-    )
+    held, name = io.StringIO(), unbroken(file.name)
+    numbers = np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
     held.write(f"# written by Lumigraph\nmtllib {name}{MATERIAL}\nusemtl surface\n")
     np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g" if file.offset is None else "v %.14g %.14g %.14g")
     np.savetxt(held, texture.uv * [1, -1] + [0, 1], "vt %.7g %.7g")

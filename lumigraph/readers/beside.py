@@ -183,10 +183,8 @@ def about_depth(capture: Capture) -> list[str]:
         return []
     times = float(np.median(plane.scale * stored[row[inside], column[inside]][there] / away[inside].numpy()[there]))
     near = [x for x in UNIT_FACTORS if 0.5 < times / x < 2]
-    text = (
-        f"{shot.planes['depth'].values} is {times:.3g} times the distance of the sparse points that it shows; its unit"
-    )
-    return [f"{text} should be {plane.scale / x:g} of the poses' and not {plane.scale:g}" for x in near]
+    text = f"{shot.planes['depth'].values} is {times:.3g} times the distance of the sparse points that it shows"
+    return [f"{text}; its unit should be {plane.scale / x:g} of the poses' and not {plane.scale:g}" for x in near]
 
 
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
