@@ -109,6 +109,11 @@ class Subject:
     set_scale: Callable[[float], None] | None = None
     embedded: bool = False
 
+    @property
+    def label(self) -> str:
+        """Heading of the panel."""
+        return "Controls" if self.embedded else self.title
+
     @cached_property
     def around(self) -> Surroundings:
         """Positions and directions of all cameras."""
