@@ -46,7 +46,8 @@ class ViewCommand:
         subject = replace(
             subject_of(opened, cameras, page=page_of(opened, method, cameras)),
             behind=behind_of(opened, method, cameras),
-            exporter=export_menu(opened, method, self.settings, self.device),
+            exporter=None if self.token else export_menu(opened, method, self.settings, self.device),
+            embedded=bool(self.token),
         )
         viewer = at_free_address(self.host, self.port, self.token, partial(Viewer, method, subject))
         with until_interrupted(), viewer:
@@ -134,7 +135,7 @@ def watching(command: Any, method: Any, data: Any, run: Any) -> Iterator[Any]:
         return
     from ..viewer import Viewer, at_free_address
 
-    subject = subject_of(run, finished=False)
+    subject = replace(subject_of(run, finished=False), embedded=bool(command.token))
     if run.photographed:
         subject = replace(subject, open_scene=lambda: data)
     start = partial(Viewer, method, subject, training=True)

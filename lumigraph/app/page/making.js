@@ -8,6 +8,7 @@ const QUALITIES = [
   ["good", "Good", "most of the possible sharpness"],
   ["best", "Best", "as sharp as it gets"],
 ];
+const LEAST = 3; // photographs of a capture
 const METHODS = [
   ["gaussian-splatting", "Gaussian splatting: quick, for pages and films"],
   ["instant-ngp", "Instant-NGP: a field, for reflections and fine detail"],
@@ -45,7 +46,8 @@ function Choose({ detail, act, uploading, show, first }) {
   const [masked, setMasked] = useState(false);
   const [known, setKnown] = useState(METHODS);
   const video = detail.photographs.some((one) => one.video);
-  const ready = detail.photographs.length > 0 && !uploading;
+  const few = detail.kind === "project" && !detail.source && !video && detail.photographs.length < LEAST;
+  const ready = detail.photographs.length > 0 && !few && !uploading;
   const times = useEstimates(detail, uploading)[method] || {};
   const start = async () => {
     const body = { quality, method, mapper, mask_object: masked };
@@ -70,7 +72,7 @@ function Choose({ detail, act, uploading, show, first }) {
       ${video && html`<label>Frames of the video<input type="number" min="3" max="1000" placeholder="by its length" value=${frames} onInput=${(event) => setFrames(event.target.value)} /></label>`}
       <label class="check"><input type="checkbox" checked=${masked} onChange=${(event) => setMasked(event.target.checked)} /> One object in front of a backdrop: mask it</label>
     </details>
-    <button class="main wide" disabled=${!ready} onClick=${start}>${uploading ? "The photographs are on their way" : "Make the scene"}</button>
+    <button class="main wide" disabled=${!ready} onClick=${start}>${uploading ? "The photographs are on their way" : few && detail.photographs.length ? `Add photographs: ${LEAST} are the least` : "Make the scene"}</button>
   </section>`;
 }
 
