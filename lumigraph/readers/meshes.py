@@ -186,7 +186,8 @@ def read_off(path: Path) -> Any:
     if not len(triangles):
         return trimesh.PointCloud(positions, colours)
     behind = [row[1 + size :] for row, size in zip(faces, sizes, strict=True)]  # one number is of a table elsewhere
-    own, of_faces = [i for i, words in enumerate(behind) if len(words) >= 3], None
+    own = [i for i, words in enumerate(behind) if len(words) >= 3]
+    of_faces: np.ndarray | None = None
     if own:
         of_faces = np.full((polygons, 3), DEFAULT_GREY, np.uint8)
         of_faces[own] = bytes_of(np.array([behind[i][:3] for i in own], np.float64))
