@@ -27,24 +27,24 @@ STEPS: dict[str, tuple[Efforts, float]] = {
 
 
 @dataclass(frozen=True)
-class Pace:
+class Durations:
     """Contents of pace.json: seconds of a photograph in captures, and of a step by method."""
 
     photograph: float = PER_PHOTOGRAPH
     step: dict[str, float] = field(default_factory=dict)
 
 
-def known() -> Pace:
+def known() -> Durations:
     try:
-        return read_json(cache_folder() / FILE, Pace)
+        return read_json(cache_folder() / FILE, Durations)
     except LumigraphError:  # there is none yet, or it was damaged
-        return Pace()
+        return Durations()
 
 
 def note_capture(item: Item, seconds: float) -> None:
     """Keep the pace of a capture that ran from its beginning."""
     before = known()
-    keep(Pace(mixed(before.photograph, seconds / max(1, given(item))), before.step))
+    keep(Durations(mixed(before.photograph, seconds / max(1, given(item))), before.step))
 
 
 def note_training(run: Path) -> None:
@@ -57,14 +57,14 @@ def note_training(run: Path) -> None:
 
         name, before, last = Run(run).method_name, known(), rows[-1]
         mean = mixed(before.step.get(name, last["seconds"] / last["step"]), last["seconds"] / last["step"])
-        keep(Pace(before.photograph, before.step | {name: mean}))
+        keep(Durations(before.photograph, before.step | {name: mean}))
 
 
 def mixed(before: float, now: float) -> float:
     return KEPT * before + (1 - KEPT) * now
 
 
-def keep(pace: Pace) -> None:
+def keep(pace: Durations) -> None:
     try:
         write_json(cache_folder() / FILE, {"photograph": pace.photograph, "step": pace.step}, ours=True)
     except (OSError, LumigraphError):  # a home that cannot be written to

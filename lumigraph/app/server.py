@@ -256,8 +256,8 @@ class App:
         }
 
     def ahead(self, item: Item) -> dict[str, Any] | None:
-        """What a scene waits for: title of the one that is made now, seconds until it ends if known, and how many wait
-        before it."""
+        """Title of the scene that a waiting one waits for, seconds until that ends if known, and how many wait before
+        it."""
         making = self.runner.making
         if making is None or making.item == item or not isinstance(job := making.job, Making):
             return None
