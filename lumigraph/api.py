@@ -11,11 +11,12 @@ description, the items done, and all of them or None; what it raises ends the wo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Num
@@ -31,6 +32,7 @@ from .commands.results import Evaluation, Exported, Film, Reports
 from .datasets.dataset import Dataset
 from .datasets.scene import Scene
 from .errors import LumigraphError
+from .export.cameras import pictures
 from .large import open_any
 from .method import Method
 from .opening import open_scene
@@ -65,24 +67,56 @@ class Model:
         """A notebook's view: a small page to turn, or a still, and a table of facts."""
         return shown(self.opened)
 
-    def render(self, cameras: Camera | Sequence[Camera], device: str = "auto", **controls: Any) -> Rendering:
-        """Pictures of cameras in the scene's frame, as those of `cameras()`, with depth in the unit of exports.
+    @overload
+    def render(self, cameras: Camera, device: str = "auto", **controls: Any) -> Rendering: ...
+    @overload
+    def render(
+        self, cameras: Sequence[Camera], device: str = "auto", **controls: Any
+    ) -> Rendering | list[Rendering]: ...
+    def render(self, cameras: Any, device: str = "auto", **controls: Any) -> Any:
+        """Pictures of cameras in the scene's frame, as those of `cameras()` and `placed`, with depth in `depth_unit`.
 
-        cameras:  one, for leading axes (height, width); several of one size, or a list, for (camera, height, width)
+        cameras:  a batch of one, for leading axes (height, width); several of one size, or a list, for (camera, height,
+                  width); a list of several sizes, for a list of renderings (height, width)
         controls: values of the method's controls, such as time=0.3
-        The unit of depth is that of the photographs' frame, or metres where --scale-by was given in metres: a unit of
-        the scene's frame times `frame.to_export.scale`; see `Frame.scale`.
+        The rendering's `extra` has normals and others, where the method has them. An `Equirectangular` lens, as of
+        `Camera.spinning`, gives ranges.
+        """
+        found = list(self.rendered(cameras, device, **controls))
+        if isinstance(cameras, Camera) and len(cameras) == 1:
+            return found[0]
+        if len({one.depth.shape for one in found}) == 1:
+            return Rendering.cat([one.reshape(1, *one.depth.shape) for one in found])
+        return found
+
+    def rendered(
+        self, cameras: Camera | Iterable[Camera], device: str = "auto", **controls: Any
+    ) -> Iterator[Rendering]:
+        """Pictures (height, width) of cameras of any sizes, in order, for more than memory holds; see `render`.
+
+        Small pictures of Gaussians are rendered several at a time, each by one thread, and a few ahead.
         """
         batches = [cameras] if isinstance(cameras, Camera) else cameras
         several = [batch[i] for batch in batches for i in range(len(batch))]
-        if len({tuple(camera.size[0].tolist()) for camera in several}) != 1:
-            raise LumigraphError("These cameras have several sizes, or are none; make them equal by `resized`")
-        seen = [self.opened.render(camera, device, **controls) for camera in several]
-        unit = self.opened.frame.to_export.scale
-        seen = [replace(one, depth=one.depth * unit) for one in seen]
-        if isinstance(cameras, Camera) and len(cameras) == 1:
-            return seen[0]
-        return Rendering.cat([one.reshape(1, *one.depth.shape) for one in seen])
+        if not several:
+            raise LumigraphError("There are no cameras to render; give one at least")
+        method, unit = self.opened.ready(device).given(**controls), self.opened.frame.to_export.scale
+        return (replace(one, depth=one.depth * unit) for one in pictures(method, several))
+
+    @property
+    def depth_unit(self) -> str:
+        """Unit of depth: "metres" where a length is known (a depth camera, GPS, control points, `metres` of `open`,
+        --scale-by), else a sentence that says what it is and how to make it metres."""
+        if self.opened.frame.in_metres:
+            return "metres"
+        return (
+            "units of the photographs' frame, for no length of this scene is known; give metres to a unit: "
+            f"lumigraph.open({str(self.opened.path)!r}, metres=...)"
+        )
+
+    def placed(self, cameras: Camera) -> Camera:
+        """Cameras with poses in the frame of exports (the photographs', or metres), in the scene's frame."""
+        return cameras.transformed(self.opened.frame.to_export.inverse.matrix)
 
     def film(self, file: Path | str, /, **options: Any) -> Film:
         """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
@@ -128,9 +162,17 @@ class Model:
         return quietly(lambda: asked.of(self.opened), progress)[0]
 
 
-def open(path: str | Path) -> Model:
-    """Open a run, a splat file or a composition. Raises LumigraphError for anything else."""
-    return Model(open_any(path))
+def open(path: str | Path, metres: float | None = None) -> Model:
+    """Open a run, a splat file or a composition. Raises LumigraphError for anything else.
+
+    metres: to a unit of the photographs' frame or of the file, where it is known; nothing is written
+    """
+    opened = open_any(path)
+    if metres is not None:
+        if not 0 < metres < math.inf:
+            raise LumigraphError(f"metres={metres} is no length; give the metres to a unit, such as 1.0")
+        opened.frame = replace(opened.frame, scale=metres, world_from_source=None, metric=True)
+    return Model(opened)
 
 
 def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:

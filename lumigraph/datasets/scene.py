@@ -96,6 +96,7 @@ class Frame:
     tracks:      boxes of moving rigid objects, in the scene's frame
     skeleton:    bones of a character at all times, in the scene's frame
     world_from_source: similarity from the capture's frame to that of control points, if there are any
+    metric:      whether a unit of the capture's frame is a metre, as of depth cameras
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -113,6 +114,14 @@ class Frame:
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
     world_from_source: tuple[Row, ...] | None = None
+    metric: bool = False
+
+    @property
+    def in_metres(self) -> bool:
+        """True where a length is known, so that exports are in metres: by the sensor, GPS, control points, or the
+        user's length, which is taken to be in metres."""
+        known = self.metric or self.origin is not None or self.world_from_source is not None
+        return known or self.scale != 1.0
 
     @property
     def is_open(self) -> bool:

@@ -214,7 +214,8 @@ class Run(Trained):
             names = read_cameras(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
-        if not alike(replace(self.frame, scale=1.0, world_from_source=None).to_json(), data.frame.to_json()):
+        learnt = replace(self.frame, scale=1.0, world_from_source=None, metric=data.frame.metric)
+        if not alike(learnt.to_json(), data.frame.to_json()):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
             raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
         if isinstance(data, Scene):
