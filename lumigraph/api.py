@@ -37,7 +37,9 @@ from .large import open_any
 from .method import Method
 from .opening import open_scene
 from .run import Opened
+from .run.records import flat
 from .system.progress import Listener, heard_by
+from .training.loggers import Logger
 
 
 class Model:
@@ -148,11 +150,11 @@ class Model:
         return open(self._made("clean", output=output, **options).path)
 
     def metrics(self) -> dict[str, Num[np.ndarray, " row"]]:
-        """Training metrics as columns by name, "step" first; NaN in rows without a value. Empty where unknown.
+        """Training metrics as columns by name, such as step, psnr and loss/tv; NaN in rows without a value.
 
-        `pandas.DataFrame(run.metrics())` is a table of them.
+        `pandas.DataFrame(run.metrics())` is a table of them. Empty where unknown.
         """
-        rows = self.opened.metrics()
+        rows = [flat(row) for row in self.opened.metrics()]
         names = dict.fromkeys(name for row in rows for name, value in row.items() if isinstance(value, int | float))
         return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
@@ -206,6 +208,7 @@ def train(
     output: str | Path | None = None,
     *,
     progress: Callable[[int, float, dict[str, Any]], object] | None = None,
+    loggers: Sequence[str | Logger] = (),
     **options: Any,
 ) -> Model:
     """Train a method, and open the run.
@@ -216,6 +219,7 @@ def train(
     progress: told after each step: its number, the share of the budget that is spent, and the line of metrics.jsonl,
               which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes.
               None: a bar in a notebook, lines on stderr elsewhere
+    loggers:  names ("tensorboard", "wandb", "trackio", "rerun") or objects that receive metrics and previews
     options:  those of `lumigraph train METHOD`
     """
     if not isinstance(scene, str | Path):
@@ -229,7 +233,7 @@ def train(
     made = command("train", method, scene, output=output, **options)
     bar = NotebookBar() if progress is None and in_notebook() else None
     told = progress or bar
-    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told)))
+    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told), loggers))
     finished(code)
     if bar:
         bar.end()
