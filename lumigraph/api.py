@@ -34,6 +34,7 @@ from .datasets.scene import Scene
 from .errors import LumigraphError
 from .export.cameras import pictures
 from .large import open_any
+from .large.opening import SAMPLE
 from .method import Method
 from .opening import open_scene
 from .run import Opened
@@ -63,7 +64,10 @@ class Model:
         return str(self.opened.path)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.opened.path)!r})"
+        return f"Model of {self.opened!r}"
+
+    def __dir__(self) -> list[str]:
+        return [name for name in [*vars(type(self)), *vars(self)] if not name.startswith("_")]
 
     def _repr_html_(self) -> str:
         """A notebook's view: a small page to turn, or a still, and a table of facts."""
@@ -175,6 +179,14 @@ def open(path: str | Path, metres: float | None = None) -> Model:
             raise LumigraphError(f"metres={metres} is no length; give the metres to a unit, such as 1.0")
         opened.frame = replace(opened.frame, scale=metres, world_from_source=None, metric=True)
     return Model(opened)
+
+
+def sample(name: str = "still-life") -> Model:
+    """Open a small cloud that comes with the package, to try things on: "still-life" or "room" (in metres).
+
+    Both show procedural scenes and are in the public domain (CC0); commands open them as sample:NAME.
+    """
+    return Model(open_any(f"{SAMPLE}{name}"))
 
 
 def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:

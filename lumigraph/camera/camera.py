@@ -41,6 +41,13 @@ class Camera:
     def __len__(self) -> int:
         return len(self.pose)
 
+    def __repr__(self) -> str:
+        """Number, lens and sizes in one line."""
+        sizes = sorted({f"{width}x{height}" for width, height in self.size.tolist()})
+        shown = f"{len(sizes)} sizes" if len(sizes) > 2 else " and ".join(sizes)
+        where = f" at {[round(x, 3) for x in self.position[0].tolist()]}" if len(self) == 1 else ""
+        return f"Camera: {len(self)} {type(self.lens).__name__}, {shown} pixels{where}"
+
     def __getitem__(self, index: int | slice | Tensor) -> Camera:
         """Some of the cameras; an int gives a batch of one."""
         keep = one_or_more(index)

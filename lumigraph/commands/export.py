@@ -456,7 +456,7 @@ What = (
 
 for _name in sorted(set(offered("exports")) - {marks.name for _, marks in map(get_args, get_args(What))}):
     try:
-        What |= Annotated[taken("exports", _name), subcommand(_name)]  # type: ignore[misc]
+        What |= Annotated[taken("exports", _name), subcommand(_name)]
     except LumigraphError as _fault:
         say(f"warning: {_fault}")
 

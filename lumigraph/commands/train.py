@@ -161,8 +161,8 @@ class Train(ViewerOptions, TrainOptions, Output):
         with watching(self, method, data, run) as viewer:
             with run.kept_if_learnt():
                 seed, looking = run.settings.seed, viewer or watch
-                told = dict(budget=budget, seed=seed, pause_at=self.pause_at, loggers=[*self.log, *loggers])
-                outcome = fit(method, data, run, watch=looking, **told)
+                told: dict[str, Any] = {"pause_at": self.pause_at, "loggers": [*self.log, *loggers]}
+                outcome = fit(method, data, run, budget=budget, seed=seed, watch=looking, **told)
             show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
         return run.folder, exit_code(outcome.signal)

@@ -1,5 +1,6 @@
 """Open trained or exported models: runs of one field or in blocks, splat files, SNeRG folders and compositions."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import LumigraphError
@@ -12,15 +13,30 @@ from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nest
 from ..run.files import MovingFile, SnergFolder, SplatFile
 from .block_run import BlockRun
 
+SAMPLE = "sample:"  # before the name of a cloud of the package
+SAMPLES: dict[str, float | None] = {"still-life": None, "room": 2.6}  # metres to a unit, where its scene has a size
+
+
+def sample_file(name: str) -> Path:
+    """File of a sample cloud by its name. Raises LumigraphError, naming those there are."""
+    if name not in SAMPLES:
+        raise LumigraphError(f"There is no sample {name!r}; there are: {', '.join(SAMPLES)}")
+    return Path(__file__).parents[1] / "samples" / f"{name}.sog"
+
 
 @reads()
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
     one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run placed by `lumigraph canonicalise` (.json).
+    "sample:NAME" is a cloud of the package, see `SAMPLES`.
 
     within: composition of which it is a part
     Raises LumigraphError, in one sentence, for anything else.
     """
+    if (name := str(path)).startswith(SAMPLE):
+        sample, metres = SplatFile(sample_file(name.removeprefix(SAMPLE))), SAMPLES[name.removeprefix(SAMPLE)]
+        sample.frame = replace(sample.frame, scale=metres or 1.0)
+        return sample
     path = Path(path)
     if is_moving(path):
         return MovingFile(path)

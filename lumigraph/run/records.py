@@ -113,7 +113,7 @@ def flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found = dict[str, Any]()
     for name, value in row.items():
         name = prefix + {"terms": "loss", "statistics": "figures"}.get(name, str(name))
-        inner = dict(enumerate(value)) if isinstance(value, list) else value
+        inner: Any = dict(enumerate(value)) if isinstance(value, list) else value
         found |= flat(inner, f"{name}/") if isinstance(inner, Mapping) else {name: value}
     return found
 
