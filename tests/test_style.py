@@ -246,7 +246,7 @@ class Outer:
 # Documents name files that are there
 
 
-ROOTS = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "docs", ROOT / "web")
+ROOTS = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "docs", ROOT / "web", ROOT / "examples")
 SOURCE = re.compile(r"[\w./-]+\.(py|pyi|js|mjs|md|svg|toml|cu|css)\b")
 NOT_OURS = {"node_modules", "__pycache__"}
 KERNEL_FILES = {"__init__.py", "reference.py", "cpu.py", "gpu.py", "faults.py"}  # of every kernel's folder
