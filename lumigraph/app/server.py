@@ -367,7 +367,7 @@ def check_source(source: Path) -> None:
 
 
 class RequestHandlers:
-    """RequestHandlers of requests, for the routes of `build`."""
+    """Answers of an app to the requests of the routes of `build`."""
 
     def __init__(self, app: App):
         self.app = app
