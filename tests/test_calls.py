@@ -284,6 +284,9 @@ def test_samples_open_everywhere(name, tmp_path, capsys):
     assert main(["export", "splats", f"sample:{name}", str(tmp_path / "a.ply")]) == 0
     assert main(["render", f"sample:{name}", "--frames", "1", "--size", "16", "--output", str(tmp_path / "a.gif")]) == 0
     assert main(["info", f"sample:{name}"]) == 0
+    both = tmp_path / "both.json"
+    assert main(["compose", f"sample:{name}", "sample:still-life", "--at", "0", "0", "0", "--output", str(both)]) == 0
+    assert lumigraph.open(both).cameras()
     capsys.readouterr()
     assert main(["info", "sample:nothing"]) == 2 and "there are: still-life, room" in capsys.readouterr().err
 

@@ -1,6 +1,5 @@
 """Open trained or exported models: runs of one field or in blocks, splat files, SNeRG folders and compositions."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from ..errors import LumigraphError
@@ -10,16 +9,18 @@ from ..files.foreign import about_file
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
 from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
-from ..run.files import MovingFile, SnergFolder, SplatFile
+from ..run.files import MovingFile, SampleCloud, SnergFolder, SplatFile
 from .block_run import BlockRun
 
 SAMPLE = "sample:"  # before the name of a cloud of the package
 SAMPLES: dict[str, float | None] = {"still-life": None, "room": 2.6}  # metres to a unit, where its scene has a size
 
 
-def sample_file(name: str) -> Path:
-    """File of a sample cloud by its name. Raises LumigraphError, naming those there are."""
-    if name not in SAMPLES:
+def without_sample(path: Path | str) -> Path:
+    """File of "sample:NAME"; any other path as it is. Raises LumigraphError for an unknown name."""
+    if not str(path).startswith(SAMPLE):
+        return Path(path)
+    if (name := str(path).removeprefix(SAMPLE)) not in SAMPLES:
         raise LumigraphError(f"There is no sample {name!r}; there are: {', '.join(SAMPLES)}")
     return Path(__file__).parents[1] / "samples" / f"{name}.sog"
 
@@ -33,10 +34,8 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     within: composition of which it is a part
     Raises LumigraphError, in one sentence, for anything else.
     """
-    if (name := str(path)).startswith(SAMPLE):
-        sample, metres = SplatFile(sample_file(name.removeprefix(SAMPLE))), SAMPLES[name.removeprefix(SAMPLE)]
-        sample.frame = replace(sample.frame, scale=metres or 1.0)
-        return sample
+    if str(path).startswith(SAMPLE):
+        return SampleCloud(without_sample(path), SAMPLES[str(path).removeprefix(SAMPLE)])
     path = Path(path)
     if is_moving(path):
         return MovingFile(path)
