@@ -24,4 +24,6 @@ class ExportCentres(Reports):
         files.claim(self.output, "points", self.overwrite, [self.source])
         means = opened.source_gaussians().means.tolist()
         files.write_bytes(self.output, "".join(f"{x},{y},{z}\n" for x, y, z in means).encode(), ours=True)
-        return Exported(self.output, {"points": len(means)}, rows={"file": str(self.output), "points": f"{len(means):,}"})
+        return Exported(
+            self.output, {"points": len(means)}, rows={"file": str(self.output), "points": f"{len(means):,}"}
+        )
