@@ -137,6 +137,17 @@ def drag(page, visitor, pixels: int) -> None:
 
 
 @pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])
+def test_inside_the_app_the_panel_is_folded_and_no_frusta_are_drawn(page, tmp_path, size):
+    scene = tiny.scene()
+    about = subject(scene, tmp_path, embedded=True)
+    with Viewer(tiny.method(scene.frame, samples=4), about, choose_address(port=0)) as made:
+        visitor = visit(made, page, size)
+        until(lambda: page.title() == "Controls")
+        until(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
+        assert not visitor.controls.surrounded
+
+
+@pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])
 def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
     """On a phone the panel begins folded, opens at a touch, and stays open."""
     visitor = visit(viewer, page, size)
