@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .api import call as call
     from .api import capture as capture
     from .api import open as open
+    from .api import sample as sample
     from .api import train as train
     from .camera import Camera as Camera
     from .camera.lens import Lens as Lens
@@ -76,6 +77,7 @@ _homes = {
     "open_dataset": "opening",
     "open_scene": "opening",
     "rasterization": "gaussians.rasterization",
+    "sample": "api",
     "train": "api",
 }
 __all__ = sorted(_homes)
@@ -92,4 +94,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*__all__, "__version__"])

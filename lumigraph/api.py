@@ -11,11 +11,12 @@ description, the items done, and all of them or None; what it raises ends the wo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Num
@@ -31,11 +32,15 @@ from .commands.results import Evaluation, Exported, Film, Reports
 from .datasets.dataset import Dataset
 from .datasets.scene import Scene
 from .errors import LumigraphError
+from .export.cameras import pictures
 from .large import open_any
+from .large.opening import SAMPLE
 from .method import Method
 from .opening import open_scene
 from .run import Opened
+from .run.records import flat
 from .system.progress import Listener, heard_by
+from .training.loggers import Logger
 
 
 class Model:
@@ -59,30 +64,65 @@ class Model:
         return str(self.opened.path)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.opened.path)!r})"
+        return f"Model of {self.opened!r}"
+
+    def __dir__(self) -> list[str]:
+        return [name for name in [*vars(type(self)), *vars(self)] if not name.startswith("_")]
 
     def _repr_html_(self) -> str:
         """A notebook's view: a small page to turn, or a still, and a table of facts."""
         return shown(self.opened)
 
-    def render(self, cameras: Camera | Sequence[Camera], device: str = "auto", **controls: Any) -> Rendering:
-        """Pictures of cameras in the scene's frame, as those of `cameras()`, with depth in the unit of exports.
+    @overload
+    def render(self, cameras: Camera, device: str = "auto", **controls: Any) -> Rendering: ...
+    @overload
+    def render(
+        self, cameras: Sequence[Camera], device: str = "auto", **controls: Any
+    ) -> Rendering | list[Rendering]: ...
+    def render(self, cameras: Any, device: str = "auto", **controls: Any) -> Any:
+        """Pictures of cameras in the scene's frame, as those of `cameras()` and `placed`, with depth in `depth_unit`.
 
-        cameras:  one, for leading axes (height, width); several of one size, or a list, for (camera, height, width)
+        cameras:  a batch of one, for leading axes (height, width); several of one size, or a list, for (camera, height,
+                  width); a list of several sizes, for a list of renderings (height, width)
         controls: values of the method's controls, such as time=0.3
-        The unit of depth is that of the photographs' frame, or metres where --scale-by was given in metres: a unit of
-        the scene's frame times `frame.to_export.scale`; see `Frame.scale`.
+        The rendering's `extra` has normals and others, where the method has them. An `Equirectangular` lens, as of
+        `Camera.spinning`, gives ranges.
+        """
+        found = list(self.rendered(cameras, device, **controls))
+        if isinstance(cameras, Camera) and len(cameras) == 1:
+            return found[0]
+        if len({one.depth.shape for one in found}) == 1:
+            return Rendering.cat([one.reshape(1, *one.depth.shape) for one in found])
+        return found
+
+    def rendered(
+        self, cameras: Camera | Iterable[Camera], device: str = "auto", **controls: Any
+    ) -> Iterator[Rendering]:
+        """Pictures (height, width) of cameras of any sizes, in order, for more than memory holds; see `render`.
+
+        Small pictures of Gaussians are rendered several at a time, each by one thread, and a few ahead.
         """
         batches = [cameras] if isinstance(cameras, Camera) else cameras
         several = [batch[i] for batch in batches for i in range(len(batch))]
-        if len({tuple(camera.size[0].tolist()) for camera in several}) != 1:
-            raise LumigraphError("These cameras have several sizes, or are none; make them equal by `resized`")
-        seen = [self.opened.render(camera, device, **controls) for camera in several]
-        unit = self.opened.frame.to_export.scale
-        seen = [replace(one, depth=one.depth * unit) for one in seen]
-        if isinstance(cameras, Camera) and len(cameras) == 1:
-            return seen[0]
-        return Rendering.cat([one.reshape(1, *one.depth.shape) for one in seen])
+        if not several:
+            raise LumigraphError("There are no cameras to render; give one at least")
+        method, unit = self.opened.ready(device).given(**controls), self.opened.frame.to_export.scale
+        return (replace(one, depth=one.depth * unit) for one in pictures(method, several))
+
+    @property
+    def depth_unit(self) -> str:
+        """Unit of depth: "metres" where a length is known (a depth camera, GPS, control points, `metres` of `open`,
+        --scale-by), else a sentence that says what it is and how to make it metres."""
+        if self.opened.frame.in_metres:
+            return "metres"
+        return (
+            "units of the photographs' frame, for no length of this scene is known; give metres to a unit: "
+            f"lumigraph.open({str(self.opened.path)!r}, metres=...)"
+        )
+
+    def placed(self, cameras: Camera) -> Camera:
+        """Cameras with poses in the frame of exports (the photographs', or metres), in the scene's frame."""
+        return cameras.transformed(self.opened.frame.to_export.inverse.matrix)
 
     def film(self, file: Path | str, /, **options: Any) -> Film:
         """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
@@ -114,11 +154,11 @@ class Model:
         return open(self._made("clean", output=output, **options).path)
 
     def metrics(self) -> dict[str, Num[np.ndarray, " row"]]:
-        """Training metrics as columns by name, "step" first; NaN in rows without a value. Empty where unknown.
+        """Training metrics as columns by name, such as step, psnr and loss/tv; NaN in rows without a value.
 
-        `pandas.DataFrame(run.metrics())` is a table of them.
+        `pandas.DataFrame(run.metrics())` is a table of them. Empty where unknown.
         """
-        rows = self.opened.metrics()
+        rows = [flat(row) for row in self.opened.metrics()]
         names = dict.fromkeys(name for row in rows for name, value in row.items() if isinstance(value, int | float))
         return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
@@ -128,9 +168,25 @@ class Model:
         return quietly(lambda: asked.of(self.opened), progress)[0]
 
 
-def open(path: str | Path) -> Model:
-    """Open a run, a splat file or a composition. Raises LumigraphError for anything else."""
-    return Model(open_any(path))
+def open(path: str | Path, metres: float | None = None) -> Model:
+    """Open a run, a splat file or a composition. Raises LumigraphError for anything else.
+
+    metres: to a unit of the photographs' frame or of the file, where it is known; nothing is written
+    """
+    opened = open_any(path)
+    if metres is not None:
+        if not 0 < metres < math.inf:
+            raise LumigraphError(f"metres={metres} is no length; give the metres to a unit, such as 1.0")
+        opened.frame = replace(opened.frame, scale=metres, world_from_source=None, metric=True)
+    return Model(opened)
+
+
+def sample(name: str = "still-life") -> Model:
+    """Open a small cloud that comes with the package, to try things on: "still-life" or "room" (in metres).
+
+    Both show procedural scenes and are in the public domain (CC0); commands open them as sample:NAME.
+    """
+    return Model(open_any(f"{SAMPLE}{name}"))
 
 
 def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:
@@ -164,6 +220,7 @@ def train(
     output: str | Path | None = None,
     *,
     progress: Callable[[int, float, dict[str, Any]], object] | None = None,
+    loggers: Sequence[str | Logger] = (),
     **options: Any,
 ) -> Model:
     """Train a method, and open the run.
@@ -174,6 +231,7 @@ def train(
     progress: told after each step: its number, the share of the budget that is spent, and the line of metrics.jsonl,
               which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes.
               None: a bar in a notebook, lines on stderr elsewhere
+    loggers:  names ("tensorboard", "wandb", "trackio", "rerun") or objects that receive metrics and previews
     options:  those of `lumigraph train METHOD`
     """
     if not isinstance(scene, str | Path):
@@ -187,7 +245,7 @@ def train(
     made = command("train", method, scene, output=output, **options)
     bar = NotebookBar() if progress is None and in_notebook() else None
     told = progress or bar
-    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told)))
+    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told), loggers))
     finished(code)
     if bar:
         bar.end()

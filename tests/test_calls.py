@@ -17,7 +17,7 @@ from budgets import budget
 
 import lumigraph
 from lumigraph.commands.calls import command
-from lumigraph.commands.cli import COMMANDS, parse
+from lumigraph.commands.cli import COMMANDS, main, parse
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
@@ -109,8 +109,10 @@ def test_several_cameras_make_a_batch(ball_run):
     one, several, listed = run.render(cameras[1]), run.render(cameras), run.render([cameras[1]])
     assert several.rgb.shape == (3, tiny.SIZE, tiny.SIZE, 3) and listed.depth.shape == (1, tiny.SIZE, tiny.SIZE)
     assert (several.rgb[1] == one.rgb).all() and (listed.depth[0] == one.depth).all()
-    with pytest.raises(LumigraphError, match="several sizes"):
-        run.render([cameras[0], cameras[1].resized(0.5)])
+    mixed = run.render([cameras[0], cameras[1].resized(0.5)])
+    assert [one.depth.shape[0] for one in mixed] == [tiny.SIZE, tiny.SIZE // 2]
+    with pytest.raises(LumigraphError, match="no cameras"):
+        run.render([])
 
 
 def test_depth_is_in_the_unit_of_exports(own_run):
@@ -236,6 +238,57 @@ def test_python_parses_no_command_line(own_run, tmp_path, monkeypatch):
 def test_a_fault_is_raised(call, said):
     with pytest.raises(LumigraphError, match=said):
         call()
+
+
+PUBLIC_NAMES = """
+Camera Collection Dataset Evaluation Exported Film Gaussians Lens LumigraphError Method Model Opened RayMethod Rays
+Rendering Run Samples Scene Shapes call capture composite fit open open_any open_dataset open_scene rasterization
+sample train
+""".split()
+MODEL_NAMES = """
+clean compress convert depth_unit evaluate export film metrics opened placed render rendered
+""".split()
+
+
+def test_public_names_are_these(ball_run):
+    """A name that goes, or changes, is a change that CHANGELOG.md has to tell of."""
+    assert sorted(lumigraph.__all__) == PUBLIC_NAMES and dir(lumigraph) == sorted([*PUBLIC_NAMES, "__version__"])
+    assert sorted(dir(lumigraph.Model(ball_run))) == MODEL_NAMES and len(MODEL_NAMES) <= 20
+
+
+def test_what_is_open_is_one_line(ball_run, ball_folder, tmp_path):
+    run, scene = lumigraph.Model(ball_run), lumigraph.open_scene(ball_folder)
+    lines = {
+        repr(run): ("Model of Run", "voxel-grid", "60 steps"),
+        repr(run.ready()): ("VoxelGrid", "parameters", "bounded", "on cpu"),
+        repr(scene.cameras): (f"{len(scene)} Pinhole", f"{tiny.SIZE}x{tiny.SIZE} pixels"),
+        repr(scene.cameras[0]): ("1 Pinhole", "at ["),
+    }
+    for line, words in lines.items():
+        assert "\n" not in line and len(line) < 300 and all(word in line for word in words), line
+    film = run.film(tmp_path / "a.gif", frames=2, size=16)
+    assert (
+        repr(film).startswith(f"Film {tmp_path / 'a.gif'}: 2 frames of 16x16")
+        and "data:image/gif" in film._repr_html_()
+    )
+    assert scene._repr_html_().count("<img") == 4 and "Scene of" in scene._repr_html_()
+
+
+@pytest.mark.parametrize("name", ["still-life", "room"])
+def test_samples_open_everywhere(name, tmp_path, capsys):
+    run = lumigraph.sample(name)
+    assert (run.depth_unit == "metres") == (name == "room") and 5000 < len(run.gaussians) <= 60_000
+    assert run.path.stat().st_size < 1_500_000
+    seen = run.render(run.cameras()["train"][0].resized(0.1))
+    assert seen.opacity.max() > 0.9 and seen.rgb.std() > 0.05
+    assert main(["export", "splats", f"sample:{name}", str(tmp_path / "a.ply")]) == 0
+    assert main(["render", f"sample:{name}", "--frames", "1", "--size", "16", "--output", str(tmp_path / "a.gif")]) == 0
+    assert main(["info", f"sample:{name}"]) == 0
+    both = tmp_path / "both.json"
+    assert main(["compose", f"sample:{name}", "sample:still-life", "--at", "0", "0", "0", "--output", str(both)]) == 0
+    assert lumigraph.open(both).cameras()
+    capsys.readouterr()
+    assert main(["info", "sample:nothing"]) == 2 and "there are: still-life, room" in capsys.readouterr().err
 
 
 def test_public_names_are_there_from_the_start():

@@ -95,9 +95,9 @@ def test_the_first_page_can_be_typed():
     assert len(lines) >= 7
 
 
-def test_a_run_renders(in_folder_of_runs):
+def test_a_sample_renders():
     view = execute("README.md")["view"]
-    assert view.rgb.shape == (tiny.SIZE, tiny.SIZE, 3) and view.rgb.std() > 0.05
+    assert view.rgb.shape == (800, 800, 3) and view.rgb.std() > 0.05
 
 
 def test_from_python(in_folder_of_runs, ball_folder, monkeypatch):
@@ -114,7 +114,8 @@ def test_from_python(in_folder_of_runs, ball_folder, monkeypatch):
             source = source.replace(before, after)
         exec(compile(source, "docs/python.md", "exec"), names)
     assert names["picture"].shape == (1, 48, 64, 3) and names["run"].method_name == "sparse-ngp"
-    assert all(Path(name).stat().st_size for name in ("film.mp4", "page.html", "scene.spz"))
+    assert all(Path(name).stat().st_size for name in ("film.mp4", "page.html", "scene.spz", "still-life.html"))
+    assert names["along_axis"].shape == (48, 64) and names["ranges"].shape == (16, 128)
     assert names["run"].metrics() is not None
 
 

@@ -17,6 +17,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.lab.benchmark.cell import Cell, CellSettings, row_of
 from lumigraph.lab.benchmark.conduct import launch
 from lumigraph.run import Run
+from lumigraph.system import plugins
 
 pytestmark = budget("runs", 8)
 
@@ -28,9 +29,9 @@ def fresh(monkeypatch, tmp_path):
     """Nothing is registered, and the cache is empty."""
     monkeypatch.setattr(methods, "_registered", {})
     monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
-    methods.elsewhere.cache_clear()
+    plugins.offered.cache_clear()
     yield
-    methods.elsewhere.cache_clear()
+    plugins.offered.cache_clear()
 
 
 @pytest.fixture
@@ -100,10 +101,10 @@ def test_a_class_from_python_leaves_a_run_that_opens(tmp_path):
 def test_packages_offer_methods_by_an_entry_point(monkeypatch, own):
     methods.load(own)
     methods._registered.clear()
-    entry = EntryPoint("their-grid", "lumigraph_method_mine:MyGrid", methods.ENTRY_POINTS)
-    broken = EntryPoint("broken", "nowhere_at_all:Thing", methods.ENTRY_POINTS)
-    monkeypatch.setattr(methods, "entry_points", lambda group: [entry, broken] if group == methods.ENTRY_POINTS else [])
-    methods.elsewhere.cache_clear()
+    entry = EntryPoint("their-grid", "lumigraph_method_mine:MyGrid", "lumigraph.methods")
+    broken = EntryPoint("broken", "nowhere_at_all:Thing", "lumigraph.methods")
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry, broken] if group == "lumigraph.methods" else [])
+    plugins.offered.cache_clear()
     kind = methods.find("their-grid")
     assert methods.name_of(kind) == "their-grid" and methods.file_of(kind) is None
     with pytest.raises(LumigraphError, match="broken cannot be loaded"):

@@ -26,11 +26,11 @@ ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each
 RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
 # Of the package: who lowers a number lowers its ceiling.
-MAX_LINES = 116_772  # of Python
+MAX_LINES = 117_507  # of Python
 MAX_LONG_FUNCTIONS = 16  # of more than 60 lines
 MAX_ANY_METHODS = 42  # parameters `method: Any`
 MAX_ROOMS = 38  # names at the top level
-MAX_OPTIONS = 1_014  # of all methods, those of parts counted for each method that holds them
+MAX_OPTIONS = 1_018  # of all methods, those of parts counted for each method that holds them
 TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
 
 
@@ -246,7 +246,7 @@ class Outer:
 # Documents name files that are there
 
 
-ROOTS = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "docs", ROOT / "web")
+ROOTS = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "docs", ROOT / "web", ROOT / "examples")
 SOURCE = re.compile(r"[\w./-]+\.(py|pyi|js|mjs|md|svg|toml|cu|css)\b")
 NOT_OURS = {"node_modules", "__pycache__"}
 KERNEL_FILES = {"__init__.py", "reference.py", "cpu.py", "gpu.py", "faults.py"}  # of every kernel's folder

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..geometry import look_at
-from .lens import Lens, Pinhole, one_or_more, rows
+from .lens import Equirectangular, Lens, Pinhole, one_or_more, rows
 from .rays import Rays
 
 RING_CAMERAS, RING_ELEVATION = 24, 15.0  # cameras per ring; degrees above the horizon
@@ -40,6 +40,13 @@ class Camera:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def __repr__(self) -> str:
+        """Number, lens and sizes in one line."""
+        sizes = sorted({f"{width}x{height}" for width, height in self.size.tolist()})
+        shown = f"{len(sizes)} sizes" if len(sizes) > 2 else " and ".join(sizes)
+        where = f" at {[round(x, 3) for x in self.position[0].tolist()]}" if len(self) == 1 else ""
+        return f"Camera: {len(self)} {type(self.lens).__name__}, {shown} pixels{where}"
 
     def __getitem__(self, index: int | slice | Tensor) -> Camera:
         """Some of the cameras; an int gives a batch of one."""
@@ -143,6 +150,27 @@ class Camera:
         position = self.position + (self.pose[:, :, :2] @ aside)
         pose = torch.cat([self.pose[:, :, :3], position[:, :, None]], -1)
         return replace(self, pose=pose, lens=replace(lens, centre=lens.centre + lens.focal * aside / focus))
+
+    @staticmethod
+    def pinhole(pose: Float[Tensor, "camera 3 4"], size: tuple[int, int], angle: float) -> Camera:
+        """Cameras of one size with square pixels. angle: of view across the picture's height, degrees, as of MuJoCo"""
+        many, focal = len(pose), 0.5 * size[1] / math.tan(0.5 * math.radians(angle))
+        pixels = torch.tensor(size).expand(many, 2)
+        return Camera(pose, Pinhole(torch.full((many, 2), focal), pixels / 2), pixels)
+
+    @staticmethod
+    def spinning(
+        pose: Float[Tensor, "camera 3 4"], beams: int = 64, columns: int = 1024, low: float = -25.0, high: float = 15.0
+    ) -> Camera:
+        """Range sensors that turn, such as a LiDAR: a row for each beam, the highest first, a column for each azimuth.
+
+        pose:      the middle column looks along +z; the axis of rotation is y
+        low, high: elevations of the lower edge of the last row and the upper edge of the first, degrees, evenly divided
+        """
+        rows_around = beams * 180 / (high - low)
+        lens = Equirectangular(*(torch.tensor([x]).expand(len(pose), 2) for x in (
+            (float(columns), rows_around), (columns / 2, high / 180 * rows_around))))  # fmt: skip
+        return Camera(pose, lens, torch.tensor([columns, beams]).expand(len(pose), 2))
 
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:

@@ -82,19 +82,21 @@ class Compose:
         from ..datasets.tracks import nodes_of
         from ..geometry import Similarity
         from ..large import open_any
+        from ..large.opening import without_sample
         from ..run.composition import CompositionPart, LitMeshFile, relative, write_composition
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
-        sources = [self.lead, *([] if self.part is None else [self.part])]
+        lead_path, part_path = without_sample(self.lead), self.part and without_sample(self.part)
+        sources = [lead_path, *([] if part_path is None else [part_path])]
         claim(self.output, "composition", self.overwrite, sources)
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         if self.part is None and self.probes is not None:
             raise LumigraphError("--probes light a mesh; name the mesh after the scene")
         lead, here = open_any(self.lead), Similarity.make(1.0)
-        named = [CompositionPart(relative(self.lead, self.output), here, edits=self.edits)]
-        if self.part is not None:
+        named = [CompositionPart(relative(lead_path, self.output), here, edits=self.edits)]
+        if self.part is not None and part_path is not None:
             part = open_any(self.part) if self.probes is None else LitMeshFile(self.part, self.probes)
             place = here
             if any(given is not None for given in (self.at, self.scale, self.turn)):
@@ -102,7 +104,7 @@ class Compose:
                 place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
             box = self.box and CropBox(*self.box)
             probes = None if self.probes is None else relative(self.probes, self.output)
-            named.append(CompositionPart(relative(self.part, self.output), place, box, probes))
+            named.append(CompositionPart(relative(part_path, self.output), place, box, probes))
         elif not self.edits.edits:
             raise LumigraphError(
                 f"Name a scene to place in {self.lead}, or edit its scene graph by --remove, --shift, --rotate, --swap "

@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, get_args
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
@@ -25,6 +25,7 @@ from ..export.options import (
 from ..files import claim
 from ..files.options import DeviceOption, Overwrite, Set, SourceOption, needed, option
 from ..files.ranges import between
+from ..system.plugins import offered, taken
 from .common import choose_device, say, show
 from .results import Exported, Reports
 
@@ -452,6 +453,12 @@ What = (
     | Annotated[ExportStereo, subcommand("stereo")]
     | Annotated[ExportWeb, subcommand("web")]
 )
+
+for _name in sorted(set(offered("exports")) - {marks.name for _, marks in map(get_args, get_args(What))}):
+    try:
+        What |= Annotated[taken("exports", _name), subcommand(_name)]
+    except LumigraphError as _fault:
+        say(f"warning: {_fault}")
 
 
 @dataclass(frozen=True)

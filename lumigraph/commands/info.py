@@ -1,6 +1,6 @@
 """`lumigraph info`: contents of a run, a folder of photographs, a mesh, a splat file or a composition."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,11 +27,14 @@ class Info:
         from ..datasets.scene import Scene
         from ..exchange import holds_points, is_moving, is_splat_file, read_gaussians, read_moving, snerg
         from ..large import BlockRun
+        from ..large.opening import SAMPLE, without_sample
         from ..opening import folder_of, open_dataset, read_capture
         from ..run import is_block_run
         from ..sfm.doctor import findings
         from . import info_tree
 
+        if self.what.startswith(SAMPLE):
+            return replace(self, what=str(without_sample(self.what))).run()
         if is_block_run(Path(self.what)):
             tree = info_tree.blocks_tree(BlockRun(self.what))
         elif (Path(self.what) / "config.json").exists():

@@ -1,5 +1,7 @@
 """Results of commands as values: the file that was written, its figures, and the rows that the terminal shows."""
 
+import base64
+import html
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -7,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from .common import choose_device, show
+
+MAX_SHOWN_BYTES = 8_000_000  # of a film within a notebook
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,23 @@ class Film(Result):
     cameras: Path
     depth: Path | None = None
     pictures: Path | None = None
+
+    def __repr__(self) -> str:
+        """Path, frames, size and time in one line."""
+        width, height = self.size
+        return (
+            f"Film {self.path}: {self.frames} frames of {width}x{height} at {self.fps:g} per second, "
+            f"{self.seconds_per_frame:.3g} s each to render"
+        )
+
+    def _repr_html_(self) -> str:
+        """Player of the film in a notebook; its path where it is too large."""
+        kind = {".mp4": "video/mp4", ".gif": "image/gif", ".webp": "image/webp"}.get(self.path.suffix.lower())
+        if kind is None or self.path.stat().st_size > MAX_SHOWN_BYTES:
+            return html.escape(repr(self))
+        data = f"data:{kind};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+        shown = f'<video controls loop src="{data}"></video>' if kind == "video/mp4" else f'<img src="{data}">'
+        return f"{shown}<br>{html.escape(repr(self))}"
 
     @property
     def seconds_per_frame(self) -> float:

@@ -38,7 +38,7 @@ class Resume(ViewerOptions, ResumeOptions):
         from ..large.training import Workers
         from .train import train_all
 
-        for name in ("seconds", "steps", "quality", "scene", "pause_at", "view"):
+        for name in ("seconds", "steps", "quality", "scene", "pause_at", "view", "log"):
             if getattr(self, name):
                 raise LumigraphError(
                     f"{folder} is a run in blocks, which goes on as it began, so --{name.replace('_', '-')} is not for "
@@ -71,7 +71,8 @@ class Resume(ViewerOptions, ResumeOptions):
         if budget.to_json() != run.settings.budget:
             run.set_budget(**budget.to_json())
         with watching(self, method, data, run) as watch:
-            outcome = fit(method, data, run, budget=budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
+            told = {"seed": run.settings.seed, "pause_at": self.pause_at, "loggers": self.log}
+            outcome = fit(method, data, run, budget=budget, watch=watch, **told)
             show_outcome(run, outcome, method, data, end_training(watch, method))
             keep_showing(watch if self.stay else None, outcome.signal)
         return exit_code(outcome.signal)

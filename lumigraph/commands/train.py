@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,6 +50,8 @@ def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | No
         return blocks.into, 0
     if (places := places_in_blocks(source, train, blocks)) is None:
         return None
+    if train.log:
+        raise LumigraphError(f"{train.scene} is learnt in blocks, each a run of its own; leave --log out")
     if blocks.address is None or train.device == "auto":
         device = choose_device(train.device)
     else:  # of the cluster's machines
@@ -132,10 +135,11 @@ class Train(ViewerOptions, TrainOptions, Output):
     def run(self) -> int:
         return self.learn()[1]
 
-    def learn(self, watch: Any = None) -> tuple[Path, int]:
+    def learn(self, watch: Any = None, loggers: Sequence[Any] = ()) -> tuple[Path, int]:
         """Train, and print the outcome. Returns the run and the exit code.
 
         watch: of `fit`, in place of the viewer of --view
+        loggers: of `fit`, beside those of --log
         """
         from ..opening import open_dataset
         from ..run import check_new
@@ -157,7 +161,8 @@ class Train(ViewerOptions, TrainOptions, Output):
         with watching(self, method, data, run) as viewer:
             with run.kept_if_learnt():
                 seed, looking = run.settings.seed, viewer or watch
-                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
+                told: dict[str, Any] = {"pause_at": self.pause_at, "loggers": [*self.log, *loggers]}
+                outcome = fit(method, data, run, budget=budget, seed=seed, watch=looking, **told)
             show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
         return run.folder, exit_code(outcome.signal)

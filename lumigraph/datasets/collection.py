@@ -78,7 +78,8 @@ class Collection:
     @cached_property
     def frame(self) -> Frame:
         first, plain = self._first.frame, Frame()
-        return replace(first, bounds=plain.bounds, source_from_scene=plain.source_from_scene, forward=None)
+        own = {"source_from_scene": plain.source_from_scene, "metric": False}
+        return replace(first, bounds=plain.bounds, forward=None, **own)
 
     @property
     def warnings(self) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import html
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -17,8 +19,9 @@ from ..camera import Camera
 from ..camera.rays import Rays
 from ..color.blending import before
 from ..errors import LumigraphError
+from ..figures import png
 from ..files.ranges import Coordinate, Point, Row, Share, between, typed
-from ..geometry import Similarity, is_similarity
+from ..geometry import Similarity, evenly, is_similarity
 from ..geometry import Vector as Vector
 from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
 from .skeleton import Skeleton
@@ -36,6 +39,7 @@ AVERAGED = {
 }
 
 
+SHOWN_PIXELS = 200  # about, along the longer side of photographs in a notebook
 Size = Annotated[float, between(1e-9, 1e9)]  # scene units
 
 
@@ -96,6 +100,7 @@ class Frame:
     tracks:      boxes of moving rigid objects, in the scene's frame
     skeleton:    bones of a character at all times, in the scene's frame
     world_from_source: similarity from the capture's frame to that of control points, if there are any
+    metric:      whether a unit of the capture's frame is a metre, as of depth cameras
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -113,6 +118,14 @@ class Frame:
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
     world_from_source: tuple[Row, ...] | None = None
+    metric: bool = False
+
+    @property
+    def in_metres(self) -> bool:
+        """True where a length is known, so that exports are in metres: by the sensor, GPS, control points, or the
+        user's length, which is taken to be in metres."""
+        known = self.metric or self.origin is not None or self.world_from_source is not None
+        return known or self.scale != 1.0
 
     @property
     def is_open(self) -> bool:
@@ -323,6 +336,14 @@ class Scene:
             f"  also    {', '.join(further) or 'nothing else'}\n"
             f"  source  {self.source or 'none'}"
         )
+
+    def _repr_html_(self) -> str:
+        """Some photographs in a row, and the text."""
+        factors = {i: max(1, int(self.cameras.size[i].max()) // SHOWN_PIXELS) for i in evenly(range(len(self)), 4)}
+        some = (self.photograph(i).reduced(factor).before(torch.ones(3)) for i, factor in factors.items())
+        pictures = (base64.b64encode(png(rgb)).decode() for rgb in some)
+        row = "".join(f'<img src="data:image/png;base64,{one}" style="margin-right: 4px">' for one in pictures)
+        return f"{row}<pre>{html.escape(repr(self))}</pre>"
 
     def pixels(self, split: str) -> int:
         """Number of pixels for training or comparison."""

@@ -43,6 +43,8 @@ PhotographsOption = Annotated[str | None, option("SCENE", "the path used in trai
 ReaderOption = Annotated[Reader | None, option("NAME", "detected", f"Layout of the folder: {LISTED}.")]
 SeedOption = Annotated[Seed, option("N", about="Seed of all random choices.")]
 StepsOption = Annotated[Steps | None, option("N", "as long as --seconds", "Train for this number of steps instead.")]
+LOG = "Also write scalars, pictures and options for a logger: tensorboard, wandb, trackio, rerun, or one of a package."
+Log = Annotated[tuple[str, ...], option("NAME ...", "none", LOG)]
 OVERWRITE = (
     "Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced anyway; folders "
     "with other files in them never are."

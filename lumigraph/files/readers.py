@@ -6,6 +6,8 @@ model that it came from; COLMAP's lenses know more than LLFF's. `--reader` overr
 
 from __future__ import annotations
 
+from ..system.plugins import offered
+
 READERS = (
     "transforms",
     "blender",
@@ -24,5 +26,6 @@ READERS = (
     "recording",
     "minecraft",
 )
-NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types
+OWN_NAMES = tuple(name.replace("_", "-") for name in READERS)
+NAMES = (*OWN_NAMES, *(name for name in offered("readers") if name not in OWN_NAMES))  # what a user types
 LISTED = f"{', '.join(NAMES[:-1])} or {NAMES[-1]}"

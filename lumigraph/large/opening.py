@@ -9,18 +9,33 @@ from ..files.foreign import about_file
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
 from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
-from ..run.files import MovingFile, SnergFolder, SplatFile
+from ..run.files import MovingFile, SampleCloud, SnergFolder, SplatFile
 from .block_run import BlockRun
+
+SAMPLE = "sample:"  # before the name of a cloud of the package
+SAMPLES: dict[str, float | None] = {"still-life": None, "room": 2.6}  # metres to a unit, where its scene has a size
+
+
+def without_sample(path: Path | str) -> Path:
+    """File of "sample:NAME"; any other path as it is. Raises LumigraphError for an unknown name."""
+    if not str(path).startswith(SAMPLE):
+        return Path(path)
+    if (name := str(path).removeprefix(SAMPLE)) not in SAMPLES:
+        raise LumigraphError(f"There is no sample {name!r}; there are: {', '.join(SAMPLES)}")
+    return Path(__file__).parents[1] / "samples" / f"{name}.sog"
 
 
 @reads()
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
     one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run placed by `lumigraph canonicalise` (.json).
+    "sample:NAME" is a cloud of the package, see `SAMPLES`.
 
     within: composition of which it is a part
     Raises LumigraphError, in one sentence, for anything else.
     """
+    if str(path).startswith(SAMPLE):
+        return SampleCloud(without_sample(path), SAMPLES[str(path).removeprefix(SAMPLE)])
     path = Path(path)
     if is_moving(path):
         return MovingFile(path)

@@ -84,6 +84,11 @@ class Method(nn.Module, ABC):
         self.progress = 1.0
         self.register_buffer("_place", torch.empty(0), persistent=False)  # knows the device, also without parameters
 
+    def __repr__(self) -> str:
+        """Name, number of parameters, space and device in one line."""
+        count, space = sum(x.numel() for x in self.parameters()), "unbounded" if self.frame.is_open else "bounded"
+        return f"{type(self).__name__}: {count:,} parameters, {space}, on {self.device}"
+
     @classmethod
     def preset(cls, device: torch.device) -> Any:
         """Default Config: the paper's on a GPU, `cpu_preset` elsewhere."""

@@ -16,8 +16,7 @@ import pkgutil
 import re
 import sys
 from contextlib import suppress
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,8 @@ from .. import files
 from ..errors import LumigraphError
 from ..files.names import meant
 from ..system.cache import cache_folder
+from ..system.plugins import offered, taken
 
-ENTRY_POINTS = "lumigraph.methods"  # group of entry points, each NAME = "package.module:Class"
 LOADED_FILE = "methods.json"  # in the cache: files of methods that this user has loaded, and their SHA-256
 
 # A method that is added comes behind these, so that no colour of theirs changes from one release to the next.
@@ -55,10 +54,9 @@ def own() -> set[str]:
     return {name.replace("_", "-") for name in modules if not name.startswith("_")}
 
 
-@cache
 def elsewhere() -> dict[str, EntryPoint]:
     """Entry points of other packages' methods, by name; those of our own names are passed over."""
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS) if entry.name not in own()}
+    return {name: entry for name, entry in offered("methods").items() if name not in own()}
 
 
 def register(kind: type[Any], name: str | None = None) -> type[Any]:
@@ -176,10 +174,7 @@ def find(name: str) -> type[Any]:
     from ..method import Method
 
     if (name := check(name)) in elsewhere() and name not in _registered:
-        try:
-            register(elsewhere()[name].load(), name)
-        except (ImportError, AttributeError) as fault:
-            raise LumigraphError(f"{name} cannot be loaded ({fault}); install its package again") from fault
+        register(taken("methods", name), name)
     if name in _registered:
         return _registered[name]
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")

@@ -5,15 +5,17 @@ Bounds, scale, splits and the loading of images are in one module, `assemble`.
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import exists
 from ..files.foreign import about_file, about_poses, is_pose_file
-from ..files.readers import LISTED, NAMES
+from ..files.readers import LISTED, NAMES, OWN_NAMES
 from ..files.reading import reads
+from ..system.plugins import taken
 from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
@@ -26,7 +28,12 @@ from .surveyed import CLOUD_SUFFIXES, OTHER_CLOUDS, describe_cloud
 from .unposed import Unposed as Unposed
 from .views import multiscale as multiscale
 
-READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
+READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in OWN_NAMES}
+for _name in NAMES[len(OWN_NAMES) :]:  # of other packages: modules with the same three names
+    try:
+        READERS[_name] = taken("readers", _name)
+    except LumigraphError as _fault:
+        warnings.warn(str(_fault), LumigraphWarning, stacklevel=2)
 
 
 @reads()

@@ -110,6 +110,7 @@ def assemble(
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
         times=span(cameras.time),
         origin=capture.origin,
+        metric=capture.metric,
     )
     tracks, unseen = seen_tracks(capture, Similarity(torch.from_numpy(matrix)), cameras[splits["train"]])
     frame = replace(

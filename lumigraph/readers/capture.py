@@ -105,6 +105,7 @@ class Capture:
     tracks:   boxes of moving rigid objects, source's frame and units, times as in `Shot.time`
     skeleton: bones of a character at all times, source's frame and units
     blocks:   of a block world, cubes with an edge of one unit of the source
+    metric:   a unit of the source is a metre
     poseless: poses are unknown, and those of the shots mean nothing
     kept:     cache pictures even where they fit into memory, since they took long to make
     """
@@ -128,6 +129,7 @@ class Capture:
     kept: bool = False
     blocks: BlockLabels | None = None
     poseless: bool = False
+    metric: bool = False
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with only some of its points."""

@@ -69,7 +69,7 @@ def read(folder: Path) -> Capture:
     shots = shots_of(pictures, root / CALIBRATION / f"{name}.txt", matrices["P2"], inertial, drive)
     tracks = read_labels(root / LABELS / f"{name}.txt", drive)
     up = (0.0, -1.0, 0.0) if drive is None else (0.0, 0.0, 1.0)
-    return Capture(str(folder), shots, up=up, reach=REACH, near=NEAR, origin=origin, tracks=tracks)
+    return Capture(str(folder), shots, up=up, reach=REACH, near=NEAR, origin=origin, tracks=tracks, metric=True)
 
 
 def shots_of(
@@ -109,7 +109,7 @@ def read_odometry(folder: Path, poses: Path) -> Capture:
     seconds = [float(row[0]) for row in read_rows(times, 1)] if times.is_file() else []
     if len(seconds) >= len(drive):
         shots = [replace(shot, time=seconds[int(shot.time or 0)]) for shot in shots]
-    return Capture(str(folder), shots, up=(0.0, -1.0, 0.0), reach=REACH, near=NEAR)
+    return Capture(str(folder), shots, up=(0.0, -1.0, 0.0), reach=REACH, near=NEAR, metric=True)
 
 
 def sequence(folder: Path) -> tuple[Path, str]:

@@ -96,7 +96,7 @@ def read_replica(folder: Path) -> Capture:
         planes = {"depth": PixelPlane(depth, "z-depth", 1 / said.scale, unknown=(0,))} if depth.is_file() else {}
         if np.isfinite(pose).all():
             shots.append(Shot(name, pose[:3], lens, (said.w, said.h), {1: picture}, planes=planes))
-    return Capture(str(folder), shots, missing=missing)
+    return Capture(str(folder), shots, missing=missing, metric=True)
 
 
 def read_scannet(folder: Path) -> Capture:
@@ -127,7 +127,7 @@ def read_scannet(folder: Path) -> Capture:
         if np.isfinite(pose).all():
             planes = {"depth": plane} if depth.is_file() else {}
             shots.append(Shot(name, pose[:3], lens, size, {1: picture}, planes=planes))
-    return Capture(str(folder), shots, missing=missing)
+    return Capture(str(folder), shots, missing=missing, metric=True)
 
 
 def differ(depth: Pinhole, depth_size: tuple[int, int], colour: Pinhole, size: tuple[int, int]) -> bool:

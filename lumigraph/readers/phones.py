@@ -143,7 +143,7 @@ def read_stray(folder: Path) -> Capture:
             planes = beside_picture(files["depth"], files["confidence"])
             size = measure(pictures[number])[0]
             shots.append(Shot(f"rgb/{number:06}", pose, lens, size, {1: pictures[number]}, planes=planes))
-    return Capture(str(folder), shots, up=UP)
+    return Capture(str(folder), shots, up=UP, metric=True)
 
 
 def find_measured(folder: Path, number: int) -> Path | None:
@@ -213,7 +213,7 @@ def read_polycam(folder: Path) -> Capture:
         ):  # present Polycam leaves it out of the others
             size = read_json(first, PolycamCamera).size
         shots.append(Shot(path.stem, opencv(said.pose), lens, size, {1: picture}, planes=planes))
-    return Capture(str(folder), shots, missing=missing, up=UP)
+    return Capture(str(folder), shots, missing=missing, up=UP, metric=True)
 
 
 def read_record3d(folder: Path) -> Capture:
@@ -239,7 +239,7 @@ def read_record3d(folder: Path) -> Capture:
         if planes and sure.is_file():
             planes = sure_planes(values, partial(unpacked, sure, shape, np.uint8), *about)
         shots.append(Shot(f"rgbd/{i}", pose, lens, (said.w, said.h), {1: picture}, planes=planes))
-    return Capture(str(folder), shots, missing=missing, up=UP)
+    return Capture(str(folder), shots, missing=missing, up=UP, metric=True)
 
 
 def unpacked(path: Path, shape: tuple[int, int], kind: Any) -> np.ndarray:

@@ -87,7 +87,7 @@ def read(folder: Path) -> Capture:
         plane = PixelPlane(depth, "z-depth", 1 / unit, unknown=(0, 65535))
         name = picture.relative_to(folder).as_posix()
         shots.append(Shot(name, np.eye(3, 4), lens, size, {1: picture}, time=float(i), planes={"depth": plane}))
-    return Capture(str(folder), shots, poseless=True)
+    return Capture(str(folder), shots, poseless=True, metric=True)
 
 
 def camera_of(folder: Path) -> tuple[Lens, float]:

@@ -54,7 +54,7 @@ def read(folder: Path) -> Capture:
             continue
         planes = {"depth": PixelPlane(depth, "z-depth", 1e-3, unknown=(0, 65535))} if depth.is_file() else {}
         shots.append(Shot(name, pose[:3], lens, measure(picture)[0], {1: picture}, planes=planes))
-    return with_depth_points(Capture(str(folder), shots, missing=missing))
+    return with_depth_points(Capture(str(folder), shots, missing=missing, metric=True))
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:

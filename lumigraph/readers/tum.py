@@ -71,7 +71,7 @@ def read(folder: Path) -> Capture:
         for name, times in given.items()
         if (np.diff(times) < 0).any()
     ]
-    return with_depth_points(Capture(str(folder), shots, missing=missing, notes=notes))
+    return with_depth_points(Capture(str(folder), shots, missing=missing, notes=notes, metric=True))
 
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:

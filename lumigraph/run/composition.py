@@ -434,6 +434,7 @@ def canonical_frame(frame: Frame, scale: float, bounds: tuple[Vector, Vector]) -
         forward=None,
         scale=1.0,
         origin=None,
+        metric=False,
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import methods
+from ..camera import Camera
 from ..composition import PlayedCloud
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
@@ -23,6 +24,7 @@ from .opened import Opened
 BOX_SHARE = 0.96  # of visible Gaussians inside the box of interest, along each axis
 # Splat files have y pointing down by custom, as the cameras they were learnt from; scenes stand upright.
 UPRIGHT_ROTATION = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+INNER_RING = 0.25  # size of a ring of cameras inside a room, of one around it
 VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
 WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
@@ -48,6 +50,23 @@ class SplatFile(Opened):
 
     def source_gaussians(self) -> Gaussians:
         return self.gaussians
+
+
+class SampleCloud(SplatFile):
+    """A cloud of the package. metres: to a unit, of a room that is seen from inside; None for an object"""
+
+    def __init__(self, path: Path, metres: float | None):
+        super().__init__(path)
+        self.inside = metres is not None
+        self.frame = replace(self.frame, scale=metres or 1.0)
+
+    def cameras(self) -> dict[str, Camera]:
+        """A ring around an object; one within a room, each camera looking across the middle."""
+        found = super().cameras()
+        if not self.inside:
+            return found
+        pose = torch.cat([found["train"].pose[:, :, :3], INNER_RING * found["train"].pose[:, :, 3:]], -1)
+        return {"train": replace(found["train"], pose=pose)}
 
 
 class MovingFile(Opened):

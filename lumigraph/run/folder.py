@@ -18,6 +18,7 @@ import json
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
@@ -214,7 +215,8 @@ class Run(Trained):
             names = read_cameras(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
-        if not alike(replace(self.frame, scale=1.0, world_from_source=None).to_json(), data.frame.to_json()):
+        learnt = replace(self.frame, scale=1.0, world_from_source=None, metric=data.frame.metric)
+        if not alike(learnt.to_json(), data.frame.to_json()):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
             raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
         if isinstance(data, Scene):
@@ -393,6 +395,17 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def commit() -> str | None:
+    """Commit of this code, short, where it lies in a checkout of its own; None for an installed package."""
+    root = Path(__file__).parents[2]
+    words = ["git", "-C", str(root), "rev-parse", "--short", "HEAD"]
+    if not (root / ".git").exists():
+        return None
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(words, capture_output=True, text=True, timeout=5, check=True).stdout.strip() or None
+    return None
 
 
 def processor(device: torch.device) -> str:

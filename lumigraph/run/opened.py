@@ -70,6 +70,11 @@ class Opened(ABC):
             self._ready = version, self.method(device)
         return self._ready[1]
 
+    def __repr__(self) -> str:
+        """One line of its facts."""
+        (_, first), *rest = self.facts().items()
+        return f"{type(self).__name__} {first}" + ": " * bool(rest) + ", ".join(f"{k} {v}" for k, v in rest)
+
     def facts(self) -> dict[str, object]:
         """Rows of the table below its picture in a notebook."""
         return {"file": self.path}

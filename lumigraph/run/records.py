@@ -108,6 +108,16 @@ class EvaluationRecord(Means):
     evaluated_on: str = "unknown"
 
 
+def flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A row of metrics.jsonl or options without nesting: {"terms": {"tv": 1}} is {"loss/tv": 1}; lists by number."""
+    found = dict[str, Any]()
+    for name, value in row.items():
+        name = prefix + {"terms": "loss", "statistics": "figures"}.get(name, str(name))
+        inner: Any = dict(enumerate(value)) if isinstance(value, list) else value
+        found |= flat(inner, f"{name}/") if isinstance(inner, Mapping) else {name: value}
+    return found
+
+
 @reads()
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl; damaged ones, such as a truncated last line, are skipped."""

@@ -158,6 +158,7 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
         tracks=tuple(track.transformed(Similarity.make(stage.unit)) for track in stage.tracks),
         skeleton=None if stage.skeleton is None else stage.skeleton.transformed(Similarity.make(stage.unit)),
         kept=kept,
+        metric=stage.depth_camera is not None and stage.depth_camera.unit == stage.unit,
     )
 
 

@@ -322,6 +322,7 @@ def moved(capture: Capture, scale: float, offset: float) -> Capture:
         bounds=((a, b, c), (d, e, f)),
         reach=scale * capture.reach,
         near=scale * capture.near,
+        metric=capture.metric and scale == 1,
         tracks=tuple(track.transformed(motion) for track in capture.tracks),
         skeleton=capture.skeleton and capture.skeleton.transformed(motion),
     )

@@ -27,6 +27,7 @@ from ..system.signals import Interrupt
 from ..system.work import at_work
 from .demand import about_memory
 from .display import TrainingDisplay
+from .loggers import Logger, Loggers
 from .verdict import shares_seen
 
 FIRST_SAVE_SECONDS = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
@@ -83,6 +84,7 @@ def fit(
     show: bool = True,
     watch: Watch | None = None,
     rehearsal: bool = True,
+    loggers: Iterable[str | Logger] = (),
 ) -> Outcome:
     """Train a method on a dataset until its steps are done or its seconds are spent.
 
@@ -93,6 +95,7 @@ def fit(
     pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
     save_every: seconds of training between checkpoints
     watch:      observer, such as the viewer
+    loggers:    receivers of each line of metrics.jsonl and of previews, by name or as objects, see `loggers`
     rehearsal:  compile all kernels by a step on a copy before the clock starts; tests without timing skip it
     Seconds are those of training alone; compiling kernels before it, saving, and pauses for the observer are counted
     apart. Ctrl-C and SIGTERM finish the current step, save and return; a second one aborts. Raises LumigraphError for a
@@ -102,7 +105,9 @@ def fit(
     budget = budget or Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
     check_memory(type(method), method.frame, method.config, method.device, learning=True)
-    with run.lock() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+    logged_to = Loggers(loggers, run)
+    locked = run.lock() if run else contextlib.nullcontext()
+    with locked, Interrupt() as interrupt, TrainingDisplay(show) as display, logged_to:
         fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
         if fresh:
             method.check_data(data)
@@ -128,7 +133,7 @@ def fit(
             now = clock.seconds if seconds is None else seconds
             return 1.0 if method.complete else budget.progress(step, now)
 
-        previews = Previews(run, method, data, spent())
+        previews = Previews(run, method, data, spent(), logged_to)
 
         def save() -> State:
             if not finite(method.parameters()):
@@ -161,6 +166,7 @@ def fit(
             if logged:
                 losses.clear()
             if run and logged:
+                logged_to.row(step, row)
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
             if clock.seconds >= next_save and spent() < 1:  # the last save comes after
                 save()
@@ -283,10 +289,10 @@ class Clock:
 class Previews:
     """Small previews of one view during training, by the dataset's preview camera. None without such a camera."""
 
-    def __init__(self, run: Run | None, method: Method, data: Dataset, progress: float):
+    def __init__(self, run: Run | None, method: Method, data: Dataset, progress: float, loggers: Loggers):
         camera = data.preview() if run else None
         self.camera = camera and camera.resized(min(1.0, PREVIEW_SIZE / int(camera.size.max())))
-        self.run, self.method = run, method
+        self.run, self.method, self.loggers = run, method, loggers
         self.next = [share for share in PREVIEW_SHARES if share > progress] if camera else []
 
     def due(self, progress: float) -> bool:
@@ -298,7 +304,9 @@ class Previews:
             return
         self.next = [share for share in self.next if share > progress]
         self.method.eval()
-        save_picture(self.run.folder / "previews" / f"{step:06d}.png", self.method.render(self.camera).rgb, ours=True)
+        rgb = self.method.render(self.camera).rgb
+        save_picture(self.run.folder / "previews" / f"{step:06d}.png", rgb, ours=True)
+        self.loggers.preview(step, rgb.cpu())
         self.method.train()
 
 

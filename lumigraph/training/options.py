@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..budget import Limited, Quality, about_quality
-from ..files.options import DeviceOption, ReaderOption, SeedOption, StepsOption, option
+from ..files.options import DeviceOption, Log, ReaderOption, SeedOption, StepsOption, option
 from ..files.ranges import Count, Downscale, Positive, Scales, Seconds, Steps
 
 DEFAULT_SECONDS = 60.0
@@ -41,6 +41,7 @@ class TrainOptions(Limited):
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
+    log: Log = ()
 
     @property
     def of_dataset(self) -> dict[str, Any]:
@@ -69,6 +70,7 @@ class ResumeOptions(Limited):
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
+    log: Log = ()
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,14 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...datasets.scene import Frame, Photograph, Scene
+from ...errors import LumigraphError
 from ...files.ranges import CloudSize, Share, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
 from ...method.capabilities import ColourPairs
 from ...method.depth import depth_layers, depth_terms
+from ...system.plugins import taken
 from ..fields.teacher import teacher_of
 from ..training.dense_points import Points, compile_sweep, seen_points
 from ..training.pose_refinement import PoseRefinement
@@ -61,6 +63,7 @@ class CloudNumbers:
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     photographs: AppearanceNumbers = AppearanceNumbers()
+    additions: tuple[str, ...] = ()  # of other packages, by the names of their entry points in lumigraph.additions
 
 
 class CloudMethod(Method, ABC):
@@ -88,6 +91,8 @@ class CloudMethod(Method, ABC):
         self.cloud = Cloud(random_cloud(frame, count, n.sh_degree, self.random(0)), most_haste=n.rates.most_haste)
         self.appearance = SplatAppearance(frame, n.photographs) if n.photographs.appearance != "no" else None
         self.register_buffer("drawn", torch.tensor(0))
+        for name in n.additions:
+            self.add_module(f"plugin_{name.replace('-', '_')}", addition_of(name, frame))
         self.cameras: Camera | None = None
         self.bands = n.sh_degree + 1
         self.current: Step | None = None
@@ -323,3 +328,13 @@ class CloudMethod(Method, ABC):
         for part in self.additions:
             part.follow(kept)
         return {"cloud.harmonics": weights[kept]}
+
+
+def addition_of(name: str, frame: Frame) -> Addition:
+    """Addition of another package. Raises LumigraphError where none has the name, and for what is no Addition."""
+    made = taken("additions", name)(frame)
+    if not isinstance(made, Addition):
+        raise LumigraphError(
+            f"{name} makes a {type(made).__name__}; derive it from lumigraph.components.clouds.Addition"
+        )
+    return made

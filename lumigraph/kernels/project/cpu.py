@@ -9,7 +9,7 @@ from .._operation import differentiable, empty
 from ..spherical_harmonics.cpu import basis, slope
 from . import MIN_ALPHA
 
-FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
+FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
 ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = (np.float32(x) for x in (0, 0.5, 1, 2, 3, 4, 6))
 MIN_DETERMINANT_RATIO = np.float32(1e-8)  # of a footprint's determinant to the blurred one's
 TINY = np.float32(1e-12)  # least length of a quaternion, and distance of the eye

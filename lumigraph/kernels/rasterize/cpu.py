@@ -30,7 +30,8 @@ from .._operation import differentiable, empty
 from ..project import MAX_ALPHA as _MAX_ALPHA
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
-FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}  # without "reassoc": see `exp2`
+# Without "reassoc": see `exp2`.
+FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
 LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
 MIN_ALPHA, MAX_ALPHA = np.float32(_MIN_ALPHA), np.float32(_MAX_ALPHA)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)

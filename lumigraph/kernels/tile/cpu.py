@@ -8,7 +8,7 @@ from numba import get_num_threads, njit, prange
 
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
-FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
+FAST = {"cache": True, "nogil": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
 MIN_ALPHA, LOG_MIN_ALPHA = np.float32(_MIN_ALPHA), math.log(_MIN_ALPHA)
 BITS = 11  # of a depth, in each of three passes of the sort
 HALF, ONE = np.float32(0.5), np.float32(1)
