@@ -3,8 +3,9 @@
     python benchmarks/reading.py --publish COMMIT      run all, in FOLDER below, and write results/reading-cpu.json
     python benchmarks/reading.py NAME --kernels        run one, with the package's kernels in place of its functions
 
-`ENGINES` names functions of the reading edition, and what computes the same in the package. `tests/test_reading_edition.py`
-compares them; here a whole program runs with them, so its pictures and errors must agree and its seconds may not.
+`ENGINES` names functions of the reading edition, and what computes the same in the package.
+`tests/test_reading_edition.py` compares them. Here a whole program runs with them: its pictures and errors must agree,
+and its seconds may not.
 Seconds are user and system time of the process over two, so other programs beside it count little; those of compiling
 kernels and of tracing the photographs are spent in a run ahead of it.
 """
@@ -28,11 +29,11 @@ import numpy as np
 import torch
 
 from lumigraph import kernels
+from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
 from lumigraph.components.fields.encodings import FourierEncoding, FrequencyEncoding
 from lumigraph.components.sampling.sampling import inverse_transform
 from lumigraph.gaussians.splatting import view_of
-from lumigraph.camera import Camera
-from lumigraph.camera.lens import Pinhole
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.kernels.hash_encode import HashLevels
 from lumigraph.kernels.octree_cells import Tree
@@ -119,9 +120,6 @@ def draw_flat(cloud, width, height, target=None):
 
 
 def census_costs(left, right, count):
-    from lumigraph.reading import stereo
-
-    del stereo
     sides = left.byte(), right.byte()
     everywhere = torch.ones(left.shape, dtype=torch.bool)
     return kernels.census_cost(*sides, everywhere, everywhere, 0, count)

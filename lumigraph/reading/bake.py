@@ -53,9 +53,8 @@ def tree(cells: Cells, sigma: Tensor, k: Tensor, depth: int = DEPTH) -> tuple[In
     From below: eight equal leaves become one that is twice as large; where they differ, their parent is a node.
     """
     leaves_sigma, leaves_k = [sigma], [k]
-    values, count = -1 - torch.arange(len(cells)), len(cells)
+    values, count, nodes = -1 - torch.arange(len(cells)), len(cells), list[Tensor]()
     size = float((BOX[1] - BOX[0]).max()) / 2**depth
-    nodes: list[Tensor] = []
     for level in range(depth):
         parent, group = torch.unique(cells // 2, dim=0, return_inverse=True)
         child = (cells % 2) @ torch.tensor([4, 2, 1])
@@ -75,16 +74,14 @@ def tree(cells: Cells, sigma: Tensor, k: Tensor, depth: int = DEPTH) -> tuple[In
         count += len(merged)
         inner = torch.ones(len(parent), dtype=torch.bool)
         inner[merged] = False
-        values[inner] = sum(len(x) for x in nodes) + torch.arange(int(inner.sum()))  # counted from the leaves
+        values[inner] = sum(map(len, nodes)) + torch.arange(1, int(inner.sum()) + 1)
         nodes, cells = [*nodes, children[inner]], parent
-        values[inner] += 1
-    table = torch.cat(nodes)
-    last = len(table)  # the root was made last; it is to be number 0, so all are counted backwards
-    table = torch.where(table > 0, last - table, table).flip(0)
+    table = torch.cat(nodes)  # the root was made last; it is to be number 0, so all are counted backwards
+    table = torch.where(table > 0, len(table) - table, table).flip(0)
     return table, torch.cat(leaves_sigma), torch.cat(leaves_k)
 
 
-def leaf(children: Int[Tensor, "node 8"], place: Cells, depth: int = DEPTH) -> tuple[Int[Tensor, " cell"], Int[Tensor, " cell"]]:
+def leaf(children: Int[Tensor, "node 8"], place: Cells, depth: int = DEPTH) -> tuple[Tensor, Tensor]:
     """Descent to the leaf at each finest cell: its entry in the tree, and its side in finest cells."""
     node, value, size = (torch.full_like(place[:, 0], x) for x in (0, 1, 2**depth))
     for level in range(depth):
@@ -97,7 +94,7 @@ def leaf(children: Int[Tensor, "node 8"], place: Cells, depth: int = DEPTH) -> t
 
 
 def march(children: Tensor, o: Tensor, d: Tensor, depth: int = DEPTH):
-    """Cells along rays, from side to side: each step leaves a leaf at its nearest wall. Rows, lengths; row -1 is empty."""
+    """Rows of leaves along rays (-1: empty) and lengths within them: each step goes to the leaf's nearest wall."""
     n, size = 2**depth, float((BOX[1] - BOX[0]).max()) / 2**depth
     o, inverse = (o - BOX[0]) / size, 1 / torch.where(d.abs() < 1e-9, 1e-9, d)  # in finest cells
     near, far = (t[:, 0] / size for t in span(size * o + BOX[0], d))
@@ -134,21 +131,21 @@ def main() -> None:
     children, sigma, k = tree(cells, sigma, k)
     used = int((children < 0).sum())
     print(f"{len(cells)} cells with density became {used} leaves below {len(children)} nodes")
-    images, poses, focal = photographs("test")
+    (image, *_), (pose, *_), focal = photographs("test")
     begin = time.process_time()
-    asked = picture(net, occupied, images[0], poses[0], focal)
+    asked = picture(net, occupied, image, pose, focal)
     middle = time.process_time()
     with torch.no_grad():
-        drawn = draw(children, sigma, k, *pinhole_rays(images[0], poses[0], focal)).view(asked.shape)
+        drawn = draw(children, sigma, k, *pinhole_rays(image, pose, focal)).view(asked.shape)
     end = time.process_time()
-    print(f"field  {psnr(asked, images[0]):.1f} dB, {middle - begin:.2f} processor seconds")
-    print(f"octree {psnr(drawn, images[0]):.1f} dB, {end - middle:.2f} processor seconds, {psnr(drawn, asked):.1f} dB to the field")
-    save("bake", images[0], asked, drawn, 0.5 + 2 * (drawn - asked))
+    print(f"field  {psnr(asked, image):.1f} dB, {middle - begin:.2f} processor seconds")
+    print(f"octree {psnr(drawn, image):.1f} dB, {end - middle:.2f} processor seconds")
+    save("bake", image, asked, drawn, 0.5 + 2 * (drawn - asked))
 
 
 if __name__ == "__main__":
     main()
 
-# In the large one: `lumigraph/methods/plenoctrees/` trains harmonics in the first place, keeps cells by their weight in
-# photographs, and trains the leaves on. `kernels/octree_cells/` walks the same tree in integers, `octree_march/` draws
+# In the large one: `lumigraph/methods/plenoctrees/` trains harmonics in the first place, keeps cells by their weight
+# in photographs, and trains the leaves on. `kernels/octree_cells/` walks the same tree, `kernels/octree_march/` draws
 # it, `octree.html` of `lumigraph export web` does so in a browser. `methods/snerg/` bakes into blocks with a network.

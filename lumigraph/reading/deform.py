@@ -1,7 +1,8 @@
 """A field that moves: one canonical scene, and a network that bends every moment back to it (Pumarola 2021; Park 2021).
 
 Each photograph of a film shows another moment, so no two agree. But points do not vanish, they move: psi(x, t) = dx
-says where a point of moment t is in the canonical scene, c(x, t) = c_canonical(x + dx). All photographs teach one field.
+is the way from a point at t to its place in the canonical scene, c(x, t) = c_canonical(x + dx). So all photographs
+teach one field.
 """
 
 import math
@@ -23,7 +24,7 @@ Points = Float[Tensor, "sample 3"]
 
 
 def window(octaves: int, alpha: float) -> Float[Tensor, " octave"]:
-    """Coarse to fine (Park 2021, eq. 8): w_j = (1 - cos(pi clamp(alpha - j, 0, 1))) / 2, so motion is smooth at first."""
+    """Coarse to fine, for a smooth start (Park 2021, eq. 8): w_j = (1 - cos(pi clamp(alpha - j, 0, 1))) / 2"""
     return (1 - torch.cos(math.pi * (alpha - torch.arange(octaves)).clamp(0, 1))) / 2
 
 
@@ -43,7 +44,9 @@ def displacement(psi: nn.Module, x: Points, t: Float[Tensor, " sample"], alpha: 
     return psi(torch.cat([waves, encode(t[:, None], TIME_OCTAVES)], 1))
 
 
-def render(net: nn.ModuleDict, psi: nn.Module, o: Tensor, d: Tensor, moment: Tensor, occupied: Tensor, alpha=float(OCTAVES), jitter=False):
+def render(
+    net, psi, o: Tensor, d: Tensor, moment: Tensor, occupied: Tensor, alpha: float = OCTAVES, jitter: bool = False
+):
     """Rays of moments through the canonical field; also how far its samples moved, weighted by what they show."""
     step = float((BOX[1] - BOX[0]).max()) / STEPS_ACROSS
     t, there = march(o, d, occupied, step, jitter)
@@ -60,13 +63,13 @@ def render(net: nn.ModuleDict, psi: nn.Module, o: Tensor, d: Tensor, moment: Ten
 def occupancy(net: nn.ModuleDict, psi: nn.Module, alpha: float) -> Bool[Tensor, "x y z"]:
     """Cells that hold something at some moment."""
     x, most = centres(), torch.zeros(CELLS**3)
-    for moment in torch.rand(4).tolist():
-        parts = [query(net, p + displacement(psi, p, torch.full((len(p),), moment), alpha), p)[0] for p in x.split(2**16)]
-        most = torch.maximum(most, torch.cat(parts))
+    for moment in torch.rand(4):
+        moved = [p + displacement(psi, p, moment.expand(len(p)), alpha) for p in x.split(2**16)]
+        most = torch.maximum(most, torch.cat([query(net, p, p)[0] for p in moved]))
     return nn.functional.max_pool3d(most.view(1, 1, CELLS, CELLS, CELLS), 3, 1, 1)[0, 0] > 0.7
 
 
-def train(net: nn.ModuleDict, psi: nn.Module, o: Tensor, d: Tensor, truth: Tensor, moment: Tensor, steps: int = STEPS) -> Tensor:
+def train(net, psi, o: Tensor, d: Tensor, truth: Tensor, moment: Tensor, steps: int = STEPS) -> Tensor:
     """Both networks on the squared error. Returns the occupancy grid."""
     groups = [{"params": net.parameters(), "lr": RATE}, {"params": psi.parameters(), "lr": 0.2 * RATE}]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
@@ -82,7 +85,6 @@ def train(net: nn.ModuleDict, psi: nn.Module, o: Tensor, d: Tensor, truth: Tenso
         loss.backward()
         optimizer.step()
         if step % 25 == 24 and step > 60:
-            occupied |= False
             occupied = occupancy(net, psi, alpha)
         if step % 40 == 39:
             print(f"step {step + 1:4}   {time.perf_counter() - begin:4.0f} s   loss {loss.item():.4f}")
@@ -110,7 +112,8 @@ def main() -> None:
         with torch.no_grad():
             rgb, dx = render(net, psi, o, d, moments[i].expand(len(o)), occupied)
         rgb, dx = rgb.view(images[i].shape), dx.view(images[i].shape)
-        print(f"moment {moments[i]:.2f}: {psnr(rgb, images[i]):.1f} dB unseen, moved up to {dx.norm(dim=2).max():.2f} scene units")
+        far = dx.norm(dim=2).max()
+        print(f"moment {moments[i]:.2f}: {psnr(rgb, images[i]):.1f} dB unseen, moved up to {far:.2f} scene units")
         shown += [images[i], rgb, 0.5 + 2 * dx]
     save("deform", *shown)
 
@@ -118,6 +121,6 @@ def main() -> None:
 if __name__ == "__main__":
     main()
 
-# In the large one: `lumigraph/methods/nerfies/` moves points by rotations as well (SE(3)), keeps them elastic, and has a
-# code for each moment; `methods/nsff/` learns flow from frame to frame, `methods/deformable_splatting/` moves Gaussians,
-# `methods/humannerf/` bones. `components/fields/deformation.py` holds the network and the window.
+# In the large one: `lumigraph/methods/nerfies/` moves points by rotations as well (SE(3)), keeps them elastic, and has
+# a code for each moment; `methods/nsff/` learns flow from frame to frame, `methods/deformable_splatting/` moves
+# Gaussians, `methods/humannerf/` bones. `components/fields/deformation.py` holds the network and the window.

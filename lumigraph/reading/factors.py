@@ -9,7 +9,7 @@ import time
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample, interpolate, softplus
+from torch.nn.functional import grid_sample, softplus
 
 from .camera import pinhole_rays
 from .data import BOX, photographs, psnr, save
@@ -19,19 +19,19 @@ from .volume import composite, weights
 
 MODES = (1, 2, 0), (0, 2, 1), (0, 1, 2)  # the two axes of a plane, and that of the line beside it
 DENSITY_COMPONENTS, COLOUR_COMPONENTS, FEATURES = 8, 16, 16  # R of each kind; outputs of B
-NODES = 48, 72, 112  # along the longest side: at first, and after each refinement
-RAYS, STEPS, STEPS_ACROSS = 1024, 320, 128
+NODES = 96  # along the longest side
+RAYS, STEPS, STEPS_ACROSS, RATES = 1024, 300, 128, (0.03, 3e-3)
 Points = Float[Tensor, "sample 3"]
 Factor = nn.ParameterList | list[Tensor]
 
 
-def plane(nodes: Float[Tensor, "component a b"], places: Float[Tensor, "sample 2"]) -> Float[Tensor, "sample component"]:
+def plane(nodes: Float[Tensor, "component a b"], places: Float[Tensor, "sample 2"]) -> Float[Tensor, "sample _"]:
     """Bilinear interpolation at places in [0, 1]^2, whose first coordinate runs along the first axis of the nodes."""
     at = (2 * places - 1).flip(1)[None, None]  # grid_sample wants (column, row) in [-1, 1]
     return grid_sample(nodes[None], at, align_corners=True, padding_mode="border")[0, :, 0].T
 
 
-def line(nodes: Float[Tensor, "component n"], places: Float[Tensor, " sample"]) -> Float[Tensor, "sample component"]:
+def line(nodes: Float[Tensor, "component n"], places: Float[Tensor, " sample"]) -> Float[Tensor, "sample _"]:
     """Linear interpolation along a line: a plane one column wide."""
     return plane(nodes[:, :, None], torch.stack([places, torch.zeros_like(places)], 1))
 
@@ -53,29 +53,9 @@ def factors(components: int, nodes: list[int], size: float) -> nn.ModuleList:
     return nn.ModuleList([nn.ParameterList(planes), nn.ParameterList(lines)])
 
 
-def nodes_of(longest: int) -> list[int]:
-    """Nodes along each axis of the box, equally far apart."""
-    side = BOX[1] - BOX[0]
-    return [max(2, round(longest * x)) for x in (side / side.max()).tolist()]
-
-
-def refined(old: nn.ModuleList, nodes: list[int]) -> nn.ModuleList:
-    """The same function on a finer grid: planes and lines are interpolated (section 4.4)."""
-    planes, lines = ([p.data[None] for p in part] for part in old)
-    planes = [
-        interpolate(p, (nodes[a], nodes[b]), mode="bilinear", align_corners=True)[0]
-        for p, (a, b, _) in zip(planes, MODES, strict=True)
-    ]
-    lines = [
-        interpolate(v, nodes[beside], mode="linear", align_corners=True)[0]
-        for v, (*_, beside) in zip(lines, MODES, strict=True)
-    ]
-    return nn.ModuleList([nn.ParameterList(planes), nn.ParameterList(lines)])
-
-
 def field() -> nn.ModuleDict:
-    nodes = nodes_of(NODES[0])
-    inputs = FEATURES + 9
+    side = BOX[1] - BOX[0]
+    nodes, inputs = [round(NODES * x) for x in (side / side.max()).tolist()], FEATURES + 9
     return nn.ModuleDict(
         {
             "density": factors(DENSITY_COMPONENTS, nodes, 0.1),
@@ -117,23 +97,15 @@ def occupancy(net: nn.ModuleDict) -> Tensor:
     return nn.functional.max_pool3d(sigma, 3, 1, 1)[0, 0] > 0.5
 
 
-def optimizer_of(net: nn.ModuleDict, share: float) -> torch.optim.Optimizer:
-    """Adam with the paper's two rates, for factors and for networks; both fall with the spent share (section 5)."""
-    grids, others = [*net["density"].parameters(), *net["colour"].parameters()], [net["basis"], net["network"]]
-    rest = [x for module in others for x in module.parameters()]
-    groups = [{"params": grids, "lr": 0.03 * 0.1**share}, {"params": rest, "lr": 3e-3 * 0.1**share}]
-    return torch.optim.Adam(groups, betas=(0.9, 0.99))
-
-
 def train(net: nn.ModuleDict, o: Tensor, d: Tensor, truth: Tensor, steps: int = STEPS) -> Tensor:
-    """Squared error, and refinements at a fifth and two fifths of the steps. Returns the occupancy grid."""
+    """Squared error, with the paper's two rates, for factors and for networks (section 5). Returns the grid."""
     occupied = torch.ones(CELLS, CELLS, CELLS, dtype=torch.bool)
-    optimizer, begin = optimizer_of(net, 0), time.perf_counter()
+    parts = [[net["density"], net["colour"]], [net["basis"], net["network"]]]
+    groups = [{"params": [x for module in part for x in module.parameters()]} for part in parts]
+    optimizer, begin = torch.optim.Adam(groups, betas=(0.9, 0.99)), time.perf_counter()
     for step in range(steps):
-        if step in (steps // 5, 2 * steps // 5):
-            nodes = nodes_of(NODES[1 + (step > steps // 5)])
-            net["density"], net["colour"] = refined(net["density"], nodes), refined(net["colour"], nodes)
-            optimizer = optimizer_of(net, step / steps)
+        for group, rate in zip(optimizer.param_groups, RATES, strict=True):
+            group["lr"] = rate * 0.1 ** (step / steps)
         chosen = torch.randint(len(o), (RAYS if step > 40 else RAYS // 4,))
         loss = (render(net, o[chosen], d[chosen], occupied, jitter=True) - truth[chosen]).square().mean()
         optimizer.zero_grad()
@@ -162,6 +134,6 @@ def main() -> None:
 if __name__ == "__main__":
     main()
 
-# In the large one: `lumigraph/methods/tensorf/` adds CP (lines alone), total variation, an L1 norm that empties the
-# grid, a box that shrinks to the object, and truncation to fewer components after training. `kernels/factor_grid/`
-# interpolates planes and lines in one loop, and keeps no product in memory.
+# In the large one: `lumigraph/methods/tensorf/` adds CP (lines alone), nodes that multiply while it learns, an L1
+# norm that empties the grid, a box that shrinks to the object, and truncation to fewer components after training.
+# `kernels/factor_grid/` interpolates planes and lines in one loop, and keeps no product in memory.

@@ -37,7 +37,7 @@ def row(corner: Int[Tensor, "*batch 3"], n: int, entries: int) -> Int[Tensor, "*
     return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) % entries
 
 
-def encode(points: Points, tables: list[Float[Tensor, "entry feature"]], sizes: list[int]) -> Float[Tensor, "sample _"]:
+def encode(points: Points, tables: list[Tensor], sizes: list[int]) -> Float[Tensor, "sample _"]:
     """Trilinear interpolation of every level's eight corners, end to end (section 3). points: in the unit cube"""
     corners = torch.cartesian_prod(*[torch.arange(2)] * 3)
     found = []
@@ -99,7 +99,7 @@ def occupancy(net: nn.ModuleDict, step: float, stop: float = 0.03) -> Bool[Tenso
     return (1 - torch.exp(-most * step) > stop).view(CELLS, CELLS, CELLS)
 
 
-def march(o: Float[Tensor, "ray 3"], d: Float[Tensor, "ray 3"], occupied: Bool[Tensor, "x y z"], step: float, jitter: bool):
+def march(o: Tensor, d: Tensor, occupied: Bool[Tensor, "x y z"], step: float, jitter: bool):
     """Steps of one length along each ray through the box, and a mask of those that lie in occupied cells."""
     near, far = span(o, d)
     count = int(((far - near).amax() / step).ceil().clamp_min(1))
@@ -148,7 +148,8 @@ def train(net: nn.ModuleDict, o: Tensor, d: Tensor, truth: Tensor, steps: int = 
             occupied = occupancy(net, step_length)
         if step % 50 == 49:
             filled = 100 * float(occupied.float().mean())
-            print(f"step {step + 1:4}   {time.perf_counter() - begin:4.0f} s   loss {loss.item():.4f}   {filled:.0f} % filled")
+            spent = time.perf_counter() - begin
+            print(f"step {step + 1:4}   {spent:4.0f} s   loss {loss.item():.4f}   {filled:.0f} % filled")
     return occupied
 
 

@@ -35,7 +35,7 @@ def captured() -> Light:
     return torch.stack([torch.stack([view(u, v)[0] for u in places.tolist()]) for v in places.tolist()])
 
 
-def pixel_in(camera: Row, own: Row, pixel: Row, z: Row | float) -> Row:
+def pixel_in(camera: Tensor, own: Tensor, pixel: Row, z: Row | float) -> Row:
     """Coordinate of a point at depth z in another camera: what is z away moves by f (own - camera) / z pixels."""
     return pixel + FOCAL * (own - camera) / z
 

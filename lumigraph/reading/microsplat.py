@@ -88,8 +88,8 @@ def backward(g: Float[np.ndarray, "pixel 3"], seen: tuple, M, o, colour):
     return np.stack([g_x, g_y], 1), g_M, (g_raw * G).sum(0), w.T @ g
 
 
-def tiles(width: int, height: int, mu, M, o) -> Iterator[tuple[Int[np.ndarray, " pixel"], Int[np.ndarray, " gaussian"]]]:
-    """Squares of pixels, each with the Gaussians that reach it: where o exp(-q/2) >= 1/255, |d_x| <= sqrt(r M^-1_xx)."""
+def tiles(width: int, height: int, mu, M, o) -> Iterator[tuple[Int[np.ndarray, " pixel"], Int[np.ndarray, " some"]]]:
+    """Squares of pixels, each with the Gaussians that reach it: o exp(-q/2) >= 1/255 where |d_x| <= sqrt(r M^-1_xx)."""
     r = 2 * np.log(np.maximum(o / MIN_ALPHA, 1))
     det = M[:, 0] * M[:, 2] - M[:, 1] ** 2
     reach = np.sqrt(r[:, None] * np.stack([M[:, 2], M[:, 0]], 1) / det[:, None])
@@ -105,7 +105,7 @@ def draw(cloud: Cloud, width: int, height: int, target: Float[np.ndarray, "pixel
     """The picture, and with a target the gradient of half its squared error in everything."""
     M, o = conics(cloud["log_scale"], cloud["angle"]), 1 / (1 + np.exp(-cloud["logit"]))
     picture = np.zeros((height * width, 3))
-    g_mu, g_M, g_o, g_colour = np.zeros_like(cloud["mu"]), np.zeros_like(M), np.zeros_like(o), np.zeros((len(o), 3))
+    g_mu, g_M, g_o, g_colour = (np.zeros_like(x) for x in (cloud["mu"], M, o, cloud["colour"]))
     for pixels, i in tiles(width, height, cloud["mu"], M, o):
         centres = np.stack([pixels % width, pixels // width], 1) + 0.5
         picture[pixels], seen = forward(centres, cloud["mu"][i], M[i], o[i], cloud["colour"][i])
@@ -127,7 +127,9 @@ def adam(values: Cloud, gradient: Cloud, state: dict, step: int, rate: float) ->
         x -= rate * RATES[name] * (m / (1 - 0.9**step)) / (np.sqrt(v / (1 - 0.99**step)) + 1e-12)
 
 
-def fit(image: Float[np.ndarray, "height width 3"], count: int = COUNT, steps: int = STEPS) -> tuple[Cloud, list[float]]:
+def fit(
+    image: Float[np.ndarray, "height width 3"], count: int = COUNT, steps: int = STEPS
+) -> tuple[Cloud, list[float]]:
     """A cloud that shows the photograph, and the mean squared error of each step."""
     height, width = image.shape[:2]
     cloud, state, errors, begin = random_cloud(image, count), {}, [], time.perf_counter()

@@ -59,7 +59,7 @@ def span(origins: Float[Tensor, "ray 3"], directions: Float[Tensor, "ray 3"]):
 
 
 def stratified(near: Float[Tensor, "ray 1"], far: Float[Tensor, "ray 1"], count: int, jitter: bool):
-    """One distance in each of `count` equal bins: t_i ~ U[near + (i-1)/N (far - near), near + i/N (far - near)] (eq. 2)"""
+    """One distance in each of N equal bins: t_i ~ U[near + (i-1)/N (far - near), near + i/N (far - near)] (eq. 2)"""
     offset = torch.rand(len(near), count) if jitter else torch.full((len(near), count), 0.5)
     return near + (far - near) * (torch.arange(count) + offset) / count
 

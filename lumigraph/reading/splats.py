@@ -8,10 +8,11 @@ import time
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from .bake import harmonics
 from .camera import project as to_pixels
 from .data import BOX, photographs, psnr, save
 
@@ -24,26 +25,22 @@ Footprints = tuple[Tensor, Tensor, Tensor, Tensor]  # centres (pixels), conics, 
 
 
 def carve(images: Tensor, poses: Tensor, focal: float, count: int) -> Cloud:
-    """Gaussians at random points that no photograph shows as background (the visual hull), in their mean colour."""
+    """Gaussians at random points that no photograph shows as background (the visual hull), all of them grey."""
     points = torch.lerp(BOX[0], BOX[1], torch.rand(40 * count, 3))
-    inside, colour = torch.ones(len(points), dtype=torch.bool), torch.zeros_like(points)
+    inside = torch.ones(len(points), dtype=torch.bool)
     for image, pose in zip(images, poses, strict=True):
         height, width = image.shape[:2]
         x, y = to_pixels((points - pose[:, 3]) @ pose[:, :3], focal, torch.tensor([width / 2, height / 2])).long().T
         inside &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        found = image[y.clamp(0, height - 1), x.clamp(0, width - 1)]
-        inside &= (found < 0.99).any(1)
-        colour += found / len(images)
+        inside &= (image[y.clamp(0, height - 1), x.clamp(0, width - 1)] < 0.99).any(1)
     kept = inside.nonzero()[:count, 0]
     spacing = float(((BOX[1] - BOX[0]).prod() * inside.float().mean() / len(kept)) ** (1 / 3))
-    harmonics = torch.zeros(len(kept), 4, 3)
-    harmonics[:, 0] = (colour[kept] - 0.5) / 0.28209479
     return {
         "means": points[kept],
         "quaternions": torch.tensor([1.0, 0, 0, 0]).repeat(len(kept), 1),
         "log_scales": torch.full((len(kept), 3), 0.4 * spacing).log(),
         "logits": torch.zeros(len(kept)),
-        "harmonics": harmonics,
+        "harmonics": torch.zeros(len(kept), 4, 3),
     }
 
 
@@ -59,7 +56,7 @@ def rotations(quaternions: Float[Tensor, "gaussian 4"]) -> Float[Tensor, "gaussi
 def project(cloud: Cloud, pose: Float[Tensor, "3 4"], focal: float, size: tuple[int, int]):
     """Footprints and depths: an ellipsoid seen from afar is an ellipse (Zwicker 2002; Kerbl 2023, eq. 5).
 
-    Sigma = Q diag(s)^2 Q^T in the world; C = J W Sigma W^T J^T on the picture, J being the slope of (u, v) in (x, y, z).
+    Sigma = Q diag(s)^2 Q^T in the world; C = J W Sigma W^T J^T on the picture, J the slope of (u, v) in (x, y, z).
     """
     W = pose[:, :3].T  # world to camera
     x, y, z = (p := (cloud["means"] - pose[:, 3]) @ W.T).unbind(1)
@@ -70,18 +67,13 @@ def project(cloud: Cloud, pose: Float[Tensor, "3 4"], focal: float, size: tuple[
     C = A @ A.mT + BLUR * torch.eye(2)
     a, b, c = C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]
     conics = torch.stack([c, -b, a], 1) / (a * c - b * b)[:, None]  # C^-1
-    return (centres, conics, cloud["logits"].sigmoid(), colours(cloud, pose[:, 3])), z
+    Y = harmonics(normalize(cloud["means"] - pose[:, 3], dim=1))
+    colours = (0.5 + (Y[..., None] * cloud["harmonics"]).sum(1)).clamp_min(0)  # 1/2 + sum_k Y_k(d) h_k
+    return (centres, conics, cloud["logits"].sigmoid(), colours), z
 
 
-def colours(cloud: Cloud, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
-    """Colour seen from a place: 1/2 + sum_k Y_k(d) h_k, spherical harmonics of two bands."""
-    x, y, z = normalize(cloud["means"] - eye, dim=1).unbind(1)
-    Y = torch.stack([0.28209479 + 0 * x, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x], 1)
-    return (0.5 + (Y[..., None] * cloud["harmonics"]).sum(1)).clamp_min(0)
-
-
-def tiles(prints: Footprints, depths: Tensor, size: tuple[int, int]) -> Iterator[tuple[Tensor, Int[Tensor, " gaussian"]]]:
-    """Squares of pixels, each with the Gaussians that reach it, nearest first: alpha >= 1/255 where q <= 2 log(255 o)."""
+def tiles(prints: Footprints, depths: Tensor, size: tuple[int, int]) -> Iterator[tuple[Tensor, Int[Tensor, " some"]]]:
+    """Squares of pixels, each with the Gaussians that reach it, nearest first: alpha >= 1/255 is q <= 2 log(255 o)."""
     centres, conics, o, _ = prints
     det = conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2
     q = 2 * (o / MIN_ALPHA).clamp_min(1).log()
@@ -92,9 +84,9 @@ def tiles(prints: Footprints, depths: Tensor, size: tuple[int, int]) -> Iterator
     for top in range(0, size[1], SIDE):
         for left in range(0, size[0], SIDE):
             corner = torch.tensor([left, top])
-            y, x = torch.meshgrid(torch.arange(top, min(top + SIDE, size[1])), torch.arange(left, min(left + SIDE, size[0])), indexing="ij")
+            y, x = torch.arange(top, min(top + SIDE, size[1])), torch.arange(left, min(left + SIDE, size[0]))
             meet = ((high >= corner) & (low <= corner + SIDE)).all(1)
-            yield torch.stack([x.flatten(), y.flatten()], 1), order[meet]
+            yield torch.cartesian_prod(y, x).flip(1), order[meet]
 
 
 def blend(at: Float[Tensor, "pixel 2"], prints: Footprints) -> tuple[Float[Tensor, "pixel 3"], tuple]:
@@ -147,22 +139,22 @@ def draw(prints: Footprints, depths: Tensor, size: tuple[int, int], target: Tens
     return picture, gradients
 
 
+@torch.no_grad()
 def refine(cloud: Cloud, slopes: Float[Tensor, " gaussian"], spread: float = 0.05) -> Cloud:
-    """Density control (section 5): drop what is faint; where the picture pulls hardest, clone small Gaussians, split
-    large ones."""
-    bright: Bool[Tensor, " gaussian"] = cloud["logits"].sigmoid() > PRUNE_OPACITY
+    """Density control (section 5): prune what is faint; where the error pulls, clone what is small, split the rest."""
+    bright = cloud["logits"].sigmoid() > PRUNE_OPACITY
     room = max(0, min(MOST - int(bright.sum()), len(slopes) // 3))
     pulled = torch.zeros_like(bright)
     pulled[(slopes * bright).argsort(descending=True)[:room]] = True
-    large = pulled & bright & (cloud["log_scales"].exp().amax(1) > spread)
-    kept, copies = {k: v[bright & ~large] for k, v in cloud.items()}, {k: v[pulled & bright] for k, v in cloud.items()}
-    halves = {k: v[large] for k, v in cloud.items()}
-    for part in (copies, halves):  # a clone moves within its own ellipsoid, as both halves do
-        turned = rotations(part["quaternions"]) @ (part["log_scales"].exp() * torch.randn_like(part["means"]))[..., None]
-        part["means"] = part["means"] + 0.7 * turned[..., 0]
-    halves["log_scales"] = halves["log_scales"] - torch.tensor(SPLIT_FACTOR).log()
-    copies["log_scales"] = copies["log_scales"] - torch.where(large[pulled & bright], SPLIT_FACTOR, 1.0).log()[:, None]
-    return {k: torch.cat([kept[k], copies[k], halves[k]]).detach() for k in cloud}
+    pulled &= bright
+    large = pulled & (cloud["log_scales"].exp().amax(1) > spread)
+    old, new = ({k: v[mask].clone() for k, v in cloud.items()} for mask in (bright, pulled))
+    for part, split, moves in (old, large[bright], large[bright]), (new, large[pulled], True):
+        within = (part["log_scales"].exp() * torch.randn_like(part["means"]))[..., None]  # of the ellipsoid
+        step = (rotations(part["quaternions"]) @ within)[..., 0]
+        part["means"] += 0.7 * step * torch.as_tensor(moves).view(-1, 1)
+        part["log_scales"] -= torch.where(split, SPLIT_FACTOR, 1.0).log()[:, None]
+    return {k: torch.cat([old[k], new[k]]) for k in cloud}
 
 
 def train(cloud: Cloud, images: Tensor, poses: Tensor, focal: float, steps: int = STEPS) -> tuple[Cloud, list[float]]:
@@ -184,7 +176,8 @@ def train(cloud: Cloud, images: Tensor, poses: Tensor, focal: float, steps: int 
         slopes += gradients[0].norm(dim=1)
         losses.append((picture - images[k]).abs().mean().item())
         if step % 50 == 49:
-            print(f"step {step + 1:4}   {time.perf_counter() - begin:4.0f} s   {len(slopes)} Gaussians   error {losses[-1]:.4f}")
+            spent = time.perf_counter() - begin
+            print(f"step {step + 1:4}   {spent:4.0f} s   {len(slopes)} Gaussians   error {losses[-1]:.4f}")
     return cloud, losses
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, pad
 
-from .camera import pixel_centres, project
+from .camera import pinhole, pixel_centres, project
 from .data import layer, photographs, save
 
 SCENE = "procedural:room,depth,size=224,views=40"  # a hand-held walk through a room, in metres
@@ -61,7 +61,7 @@ def census_costs(left: Grey, right: Grey, count: int) -> Costs:
 def along(costs: Costs, dx: int, dy: int) -> Costs:
     """Costs along one path (eq. 13): a disparity pays for itself, and for having changed on the way.
 
-        L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + P1, min_k L(q, k) + P2) - min_k L(q, k),   q = p - (dx, dy)
+    L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + P1, min_k L(q, k) + P2) - min_k L(q, k),   q = p - (dx, dy)
     """
     if dy == 0:
         return along(costs.transpose(0, 1), dy, dx).transpose(0, 1)
@@ -101,14 +101,16 @@ def main() -> None:
     grey = [(255 * picture.mean(2)).round() for picture in pictures]
     found = disparity(census_costs(*grey, DISPARITIES))
     z = baseline * focal / found.clamp_min(0.5)  # similar triangles: d / f = b / z
-    rays = torch.nn.functional.normalize(torch.cat([(pixel_centres(z.shape[1], z.shape[0]) - torch.tensor(
-        [z.shape[1] / 2, z.shape[0] / 2])) / focal, torch.ones(z.numel(), 1)], 1), dim=1)  # fmt: skip
+    height, width = z.shape
+    rays = pinhole(pixel_centres(width, height), focal, torch.tensor([width / 2, height / 2]))
     truth = layer("depth", "train", SCENE)[pair[0]]
     turned = rectified(truth[..., None].expand(-1, -1, 3), left, rotation, focal)[..., 0] * rays[:, 2].view(z.shape)
     known = torch.isfinite(turned) & (turned > 0)
     known[:, :DISPARITIES] = False  # which the right picture does not show
     error = ((z - turned).abs() / turned)[known]
-    print(f"baseline {baseline:.3f} m, focal length {focal:.0f} px, disparities {found.min():.1f} to {found.max():.1f} px")
+    print(
+        f"baseline {baseline:.3f}, focal length {focal:.0f} px, disparities {found.min():.1f} to {found.max():.1f} px"
+    )
     print(f"median depth error {100 * error.median():.1f} %, beyond 10 % at {100 * (error > 0.1).float().mean():.0f} %")
     shown = [(0.6 / x.clamp_min(0.1))[..., None].expand(-1, -1, 3) for x in (z, turned)]
     save("stereo", *pictures, *shown)

@@ -9,9 +9,10 @@ import time
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import logsigmoid
 
 from .camera import pinhole_rays
-from .data import BOX, layer, photographs, psnr, save
+from .data import layer, photographs, psnr, save
 from .nerf import encode, invert, rays_of, span, stratified
 from .volume import composite, expected_depth
 
@@ -26,7 +27,7 @@ def network() -> nn.ModuleDict:
     last = nn.Linear(WIDTH, 1 + WIDTH)
     nn.init.zeros_(last.weight[:1])
     nn.init.zeros_(last.bias)
-    colour = nn.Sequential(nn.Linear(9 + WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 3))
+    colour = nn.Sequential(nn.Linear(9 + WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 3))
     deviation = nn.ParameterDict({"v": nn.Parameter(torch.tensor(0.3))})
     return nn.ModuleDict({"distance": nn.Sequential(*layers, last), "colour": colour, "deviation": deviation})
 
@@ -47,13 +48,12 @@ def with_gradient(net: nn.ModuleDict, x: Points, create: bool) -> tuple[Tensor, 
 
 
 def alphas(f: Float[Tensor, "*n"], slope: Float[Tensor, "*n"], delta: Float[Tensor, "*n"], s: Tensor | float):
-    """Opacity of intervals: alpha = max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0), Phi(f) = 1 / (1 + exp(-s f)) (eq. 13).
+    """Opacity of intervals, max((Phi(f_i) - Phi(f_{i+1})) / Phi(f_i), 0) with Phi(f) = 1 / (1 + exp(-s f)) (eq. 13).
 
     f, slope: in the interval's middle; the ends are f -+ slope delta / 2. Where f rises, the ray leaves: no light.
     """
     half = 0.5 * slope.clamp(max=0) * delta
-    first, last = torch.sigmoid(s * (f - half)), torch.sigmoid(s * (f + half))
-    return (first - last) / first.clamp_min(1e-9)
+    return 1 - torch.exp(logsigmoid(s * (f + half)) - logsigmoid(s * (f - half)))  # 1 - Phi(f_{i+1}) / Phi(f_i)
 
 
 def weights(alpha: Float[Tensor, "ray sample"]) -> Float[Tensor, "ray sample"]:

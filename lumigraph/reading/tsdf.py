@@ -35,7 +35,7 @@ def sample(values: Float[Tensor, "height width channel"], pixels: Float[Tensor, 
     return grid_sample(values.permute(2, 0, 1)[None], at, mode, "border", align_corners=False)[0, :, 0].T
 
 
-def fuse(volume: Volume, points: Float[Tensor, "voxel 3"], depth: Tensor, rgb: Tensor, pose: Tensor, focal: float) -> Volume:
+def fuse(volume: Volume, points: Float[Tensor, "voxel 3"], depth: Tensor, rgb: Tensor, pose: Tensor, focal: float):
     """Integrate one depth picture (Curless and Levoy 1996, eqs. 3 and 4).
 
         d = min((depth - |p - o|) / truncation, 1)        D <- (W D + d) / (W + 1)        W <- W + 1
@@ -100,7 +100,8 @@ def main() -> None:
         t, normals, rgb, hit = cast(fused, shape, *pinhole_rays(image, pose, focal))
         both = hit & truth.isfinite()
         error = (t - truth)[both].abs()
-        print(f"{count:3} depth pictures: {100 * both.sum() / truth.isfinite().sum():3.0f} % seen, {error.median():.4f} off")
+        share = 100 * both.sum() / truth.isfinite().sum()
+        print(f"{count:3} depth pictures: {share:3.0f} % seen, {error.median():.4f} off")
         shown += [torch.where(hit[:, None], x, 1).view(image.shape) for x in (0.5 + 0.5 * normals, rgb)]
     save("tsdf", *shown)
 
