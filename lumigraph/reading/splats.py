@@ -16,9 +16,9 @@ from .bake import harmonics
 from .camera import project as to_pixels
 from .data import BOX, photographs, psnr, save
 
-COUNT, MOST, STEPS, SIDE = 1500, 3500, 450, 16  # Gaussians at first and at most; steps; pixels of a tile's side
+COUNT, MOST, STEPS, SIDE = 1500, 3000, 320, 16  # Gaussians at first and at most; steps; pixels of a tile's side
 MIN_ALPHA, MAX_ALPHA, BLUR = 1 / 255, 0.99, 0.3  # BLUR: square pixels, so that no ellipse falls between pixels
-REFINE_EVERY, REFINE_UNTIL, SPLIT_FACTOR, PRUNE_OPACITY = 60, 300, 1.6, 0.02
+REFINE_EVERY, REFINE_UNTIL, SPLIT_FACTOR, PRUNE_OPACITY = 50, 200, 1.6, 0.02
 RATES = {"means": 6e-3, "quaternions": 5e-3, "log_scales": 2e-2, "logits": 5e-2, "harmonics": 1.5e-2}
 Cloud = dict[str, Tensor]  # the names of RATES, a row for each Gaussian
 Footprints = tuple[Tensor, Tensor, Tensor, Tensor]  # centres (pixels), conics, opacities, colours
