@@ -1,6 +1,7 @@
 """The reading edition beside the package: lines, processor seconds, quality, and the same work with the kernels.
 
-    python benchmarks/reading.py --publish COMMIT      run all, in FOLDER below, and write results/reading-cpu.json
+    python benchmarks/reading.py --publish COMMIT      run all programs, and write results/reading-cpu.json
+    python benchmarks/reading.py --operations COMMIT   time single operations on equal inputs, in half a minute
     python benchmarks/reading.py NAME --kernels        run one, with the package's kernels in place of its functions
 
 `ENGINES` names functions of the reading edition, and what computes the same in the package.
@@ -20,6 +21,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -223,27 +225,97 @@ def figure(name: str, printed: str) -> str:
     return found[-1][1] + (" scene units" if name in ("tsdf", "surface") else "")
 
 
-def publish(commit: str, names: list[str]) -> None:
-    """Run programs, with and without kernels, and write their rows. Rows of other programs stay."""
+def inputs(name: str) -> tuple[str, tuple[Any, ...]]:
+    """An operation of a program, "file.function", and inputs about as large as the program's own."""
+    program = module(name)
+    torch.manual_seed(0)
+    rays = torch.rand(1024, 96)
+    if name == "nerf":
+        return "nerf.invert", (rays.sort(1).values, rays[:, 1:], torch.rand(1024, 24).sort(1).values)
+    if name in ("volume", "surface"):
+        return f"{name}.weights", (rays, 0.1 * rays) if name == "volume" else (0.3 * rays,)
+    if name in ("hashgrid", "deform", "pose"):
+        sizes = program.resolutions(8, 16, 256) if name == "hashgrid" else module("hashgrid").resolutions(8, 16, 256)
+        tables = [torch.randn(min((n + 1) ** 3, 2**15), 2) for n in sizes]
+        return "hashgrid.encode", (torch.rand(20_000, 3), tables, sizes)
+    if name == "factors":
+        return "factors.products", (torch.rand(20_000, 3), *program.factors(16, [96, 96, 48], 1.0))
+    if name == "bake":
+        place = torch.cartesian_prod(*[torch.arange(64)] * 3)
+        cells = place[((place - 31.5).norm(dim=1) < 20) & (place[:, 2] < 32)]
+        program.DEPTH = 6
+        tree = program.tree(cells, torch.full((len(cells),), 9.0) + cells[:, 0], torch.zeros(len(cells), 4, 3), 6)
+        view = module("camera").look_at(torch.tensor([2.0, -2.5, 1.0]), torch.zeros(3))
+        return "bake.draw", (*tree, *module("camera").pinhole_rays(torch.zeros(64, 64, 3), view, 100.0))
+    if name == "microsplat":
+        image = np.random.default_rng(0).random((128, 128, 3))
+        return "microsplat.draw", (program.random_cloud(image, 900), 128, 128, image.reshape(-1, 3))
+    if name == "splats":
+        cloud = {"means": torch.randn(2500, 3) * 0.3, "quaternions": torch.randn(2500, 4)}
+        cloud |= {"log_scales": torch.randn(2500, 3) * 0.3 - 3.2, "logits": torch.randn(2500)}
+        cloud["harmonics"] = torch.randn(2500, 4, 3) * 0.3
+        view = module("camera").look_at(torch.tensor([2.0, -2.5, 1.0]), torch.zeros(3))
+        return "splats.draw", (*program.project(cloud, view, 197.0, (128, 128)), (128, 128), torch.rand(128, 128, 3))
+    if name == "stereo":
+        return "stereo.disparity", (torch.randint(0, 30, (120, 160, 40)),)
+    points, shape = program.voxel_centres()
+    view = module("camera").look_at(torch.tensor([2.0, -2.5, 1.0]), torch.zeros(3))
+    flat = 3 + torch.zeros(128, 128)
+    return "tsdf.fuse", (program.empty(len(points)), points, flat, torch.rand(128, 128, 3), view, 197.0)
+
+
+def milliseconds(function: Callable[..., Any], *given: Any) -> float:
+    """Processor time of one call, the least of three after one."""
+    found = []
+    with torch.no_grad():
+        for _ in range(4):
+            begin = time.process_time()
+            function(*given)
+            found.append(1000 * (time.process_time() - begin))
+    return min(found[1:])
+
+
+def operations(commit: str) -> None:
+    """Time one operation of each program with the program's own function and with the package's, on equal inputs."""
+    for name in ENGINES:
+        place, given = inputs(name)
+        owner, attribute = place.split(".")
+        own = getattr(module(owner), attribute)
+        row = {"operation": place, "ms": milliseconds(own, *given)}
+        row["kernel_ms"] = milliseconds(ENGINES[name].get(place) or HASH[place], *given)
+        print(name, row, flush=True)
+        write(commit, name, row)
+
+
+def write(commit: str, name: str, row: dict[str, Any]) -> None:
+    """Add figures of one program to the results; those of others stay."""
     rows = {row["name"]: row for row in json.loads(RESULTS.read_text("utf-8"))["cells"]} if RESULTS.exists() else {}
+    lines = len((FOLDER / f"{name}.py").read_text("utf-8").splitlines())
+    rows[name] = rows.get(name, {}) | {"name": name, "lines": lines} | row
+    found = {"commit": commit, "machine": "cpu, AMD EPYC, 2 cores", "cells": [rows[x] for x in NAMES if x in rows]}
+    found["commands"] = [f"python benchmarks/reading.py --{x} COMMIT" for x in ("publish", "operations")]
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+
+
+def publish(commit: str, names: list[str]) -> None:
+    """Run programs, with and without kernels, and write their rows."""
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
             seconds, printed = measured(name, Path(folder), False)
-            row = {"name": name, "lines": len((FOLDER / f"{name}.py").read_text("utf-8").splitlines())}
-            row |= {"seconds": round(seconds, 1), "figure": figure(name, printed)}
+            row: dict[str, Any] = {"seconds": round(seconds, 1), "figure": figure(name, printed)}
             if name in ENGINES:
                 with_kernels, printed = measured(name, Path(folder), True)
                 row |= {"kernel_seconds": round(with_kernels, 1), "kernel_figure": figure(name, printed)}
-        rows[name] = row
-        print(row, flush=True)
-        found = {"commit": commit, "machine": "cpu, AMD EPYC, 2 cores", "cells": [rows[x] for x in NAMES if x in rows]}
-        found["commands"] = ["python benchmarks/reading.py --publish COMMIT"]
-        RESULTS.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+        print(name, row, flush=True)
+        write(commit, name, row)
 
 
 def main(words: list[str]) -> None:
     if words[:1] == ["--publish"]:
         publish(words[1], words[2:] or list(NAMES))
+        return
+    if words[:1] == ["--operations"]:
+        operations(words[1])
         return
     if words[1:] == ["--kernels"]:
         engaged(words[0])

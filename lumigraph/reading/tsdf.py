@@ -13,7 +13,7 @@ from .camera import pinhole_rays, project
 from .data import BOX, layer, photographs, save
 from .nerf import span
 
-VOXEL, TRUNCATION, NOISE = 1 / 50, 4 / 50, 0.02  # scene units; NOISE: deviation of each measured distance
+VOXEL, TRUNCATION, NOISE = 1 / 64, 4 / 64, 0.02  # scene units; NOISE: deviation of each measured distance
 Volume = tuple[Float[Tensor, " voxel"], Float[Tensor, " voxel"], Float[Tensor, "voxel 3"]]  # D, W, colour
 
 
