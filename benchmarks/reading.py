@@ -109,12 +109,12 @@ def draw_flat(cloud, width, height, target=None):
     conics = microsplat.conics(cloud["log_scale"], cloud["angle"])
     opacity = 1 / (1 + np.exp(-cloud["logit"]))
     given = [torch.tensor(x, dtype=torch.float32) for x in (cloud["mu"], conics, opacity, cloud["colour"])]
-    leaves = tuple(x.requires_grad_() for x in given)
-    depths = torch.ones(len(conics))
-    tiles = kernels.tile(leaves[0], leaves[1], leaves[2], depths, (width, height))
-    picture = kernels.rasterize(*leaves, depths, tiles, 0.0)[0].view(-1, 3)
-    if target is not None:
-        (0.5 * (picture - torch.tensor(target, dtype=torch.float32)).square().sum()).backward()
+    leaves, depths = tuple(x.requires_grad_() for x in given), torch.ones(len(conics))
+    with torch.enable_grad():
+        tiles = kernels.tile(leaves[0], leaves[1], leaves[2], depths, (width, height))
+        picture = kernels.rasterize(*leaves, depths, tiles, 0.0)[0].view(-1, 3)
+        if target is not None:
+            (0.5 * (picture - torch.tensor(target, dtype=torch.float32)).square().sum()).backward()
     g_mu, g_conics, g_o, g_colour = (np.zeros(x.shape) if x.grad is None else x.grad.double().numpy() for x in leaves)
     scale, angle = microsplat.conics_gradient(cloud["log_scale"], cloud["angle"], g_conics)
     gradient = {"mu": g_mu, "log_scale": scale, "angle": angle, "logit": g_o * opacity * (1 - opacity)}
@@ -275,9 +275,9 @@ def milliseconds(function: Callable[..., Any], *given: Any) -> float:
     return min(found[1:])
 
 
-def operations(commit: str) -> None:
+def operations(commit: str, names: list[str]) -> None:
     """Time one operation of each program with the program's own function and with the package's, on equal inputs."""
-    for name in ENGINES:
+    for name in names:
         place, given = inputs(name)
         owner, attribute = place.split(".")
         own = getattr(module(owner), attribute)
@@ -315,7 +315,7 @@ def main(words: list[str]) -> None:
         publish(words[1], words[2:] or list(NAMES))
         return
     if words[:1] == ["--operations"]:
-        operations(words[1])
+        operations(words[1], words[2:] or list(ENGINES))
         return
     if words[1:] == ["--kernels"]:
         engaged(words[0])

@@ -7,9 +7,9 @@
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
-choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`, `table: reading` of
-`reading.py --publish`;
-`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
+`table: reading` of `reading.py --publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and
+the commands of those rows.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from .camera import pinhole, pixel_centres, project
 from .data import layer, photographs, save
 
 SCENE = "procedural:room,depth,size=224,views=40"  # a hand-held walk through a room, in metres
-FIRST, SECOND, DISPARITIES = 8, 9, 40
+FIRST, SECOND, DISPARITIES = 12, 13, 40
 P1, P2 = 4, 24  # penalties of a disparity that changes by one pixel along a path, and by more
 PATHS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]  # (dx, dy)
 Grey = Float[Tensor, "height width"]
