@@ -229,3 +229,27 @@ def test_the_page_is_labelled_and_fits_a_phone(served, page, faults):
     page.emulate_media(color_scheme="light")
     assert dark != page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert faults == []
+
+
+def test_a_title_of_any_length_fits_and_is_changed_beside_the_scene(served, page, faults):
+    item = new_project(served.root, "W" * 120)
+    for i in range(2):
+        (item.photographs / f"{i}.jpg").write_bytes(jpeg(i, (160, 120)))
+    page.set_viewport_size({"width": 360, "height": 740})
+    page.goto(served.address.url)
+    page.get_by_role("link", name="Open W").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+    page.goto(f"{served.address.url}/#{item.key}")
+    make = page.get_by_role("button", name="Add photographs: 3 are the least")
+    make.wait_for()
+    assert make.is_disabled()
+    (item.photographs / "2.jpg").write_bytes(jpeg(2, (160, 120)))
+    page.get_by_role("button", name="Make the scene").wait_for()
+    assert re.search(r"about \d+ (s|min)", page.get_by_role("radiogroup", name="Quality").inner_text())
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("New name").fill("Short")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Short").wait_for()
+    assert item.record.title == "Short" and faults == []

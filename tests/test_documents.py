@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import runpy
+import shlex
 from functools import cache
 from pathlib import Path
 from textwrap import indent
@@ -21,6 +22,7 @@ from test_probes import uniform
 
 import lumigraph
 from lumigraph import methods
+from lumigraph.commands.cli import parse
 from lumigraph.components.sampling.importance import importance
 from lumigraph.exchange.packing import Stored, most_important
 from lumigraph.light.probes import write_probes
@@ -77,6 +79,20 @@ def test_every_block_has_a_test():
     }
     assert set(blocks()) == tested | ELSEWHERE | NEEDS_DATA
     assert written("```python\na = 1\n```\n```\nb\n```\n") == ["a = 1\n"]
+
+
+def test_the_first_page_can_be_typed():
+    """Each command is understood, opens what an earlier one wrote, and writes a name that is not there yet."""
+    there = {"photos"}
+    lines = re.findall(r"^lumigraph .*", (ROOT / "docs" / "start.md").read_text("utf-8"), re.MULTILINE)
+    for line in lines:
+        words = shlex.split(line, comments=True)[1:]
+        parse(words)
+        new = words[words.index("--output") + 1] if "--output" in words else words[-1] if words[0] == "export" else ""
+        names = [word.rstrip("/") for word in words[1:] if word.rstrip("/") in there]
+        assert names and new not in there, line
+        there |= {new} - {""}
+    assert len(lines) >= 7
 
 
 def test_a_run_renders(in_folder_of_runs):

@@ -53,6 +53,7 @@ def visit(viewer, page, size=SIZE):
     page.goto(viewer.address.url)
     visitor = until(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
     visitor.controls._sharpest.value = SHARPEST
+    until(lambda: visitor._arrived)  # a client's first camera is three.js's own
     settle(visitor)
     return visitor
 
@@ -133,6 +134,17 @@ def drag(page, visitor, pixels: int) -> None:
     page.mouse.up()
     until(lambda: visitor.request().pose != before)
     until(visitor.painter.settled.is_set)
+
+
+@pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])
+def test_inside_the_app_the_panel_is_folded_and_no_frusta_are_drawn(page, tmp_path, size):
+    scene = tiny.scene()
+    about = subject(scene, tmp_path, embedded=True)
+    with Viewer(tiny.method(scene.frame, samples=4), about, choose_address(port=0)) as made:
+        visitor = visit(made, page, size)
+        until(lambda: page.title() == "Controls")
+        until(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
+        assert not visitor.controls.surrounded
 
 
 @pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])

@@ -58,7 +58,7 @@ KINDS: dict[ShareName, ShareKind] = {
         lambda n: (n or 0) * SPZ_BYTES_PER_GAUSSIAN,
         True,
     ),
-    "mesh": ShareKind("Mesh", "A coloured surface, as .glb", ".glb", "export mesh", lambda n: MESH_BYTES),
+    "mesh": ShareKind("Mesh", "A surface with a texture, as .glb", ".glb", "export mesh", lambda n: MESH_BYTES),
     "points": ShareKind("Points", "Coloured points, as .ply", ".ply", "export points", lambda n: POINTS_BYTES),
 }
 
@@ -122,6 +122,8 @@ def share_request(item: Item, job: ShareJob) -> Request:
         options["title"] = item.record.title
     if job.kind in ("mesh", "points"):
         options["origin"] = False  # the place on Earth stays at home
+    if job.kind == "mesh":
+        options["texture"] = True
     return Request(KINDS[job.kind].command, options)
 
 

@@ -45,7 +45,8 @@ class ViewCommand:
         subject = replace(
             subject_of(opened, cameras, page=page_of(opened, method, cameras)),
             behind=behind_of(opened, method, cameras),
-            exporter=export_menu(opened, method, self.settings, self.device),
+            exporter=None if self.token else export_menu(opened, method, self.settings, self.device),
+            embedded=bool(self.token),
         )
         address = choose_address(self.host, self.port, self.token)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
@@ -133,7 +134,7 @@ def watching(command: Any, method: Any, data: Any, run: Any) -> Iterator[Any]:
         return
     from ..viewer import Viewer, choose_address
 
-    subject = subject_of(run, finished=False)
+    subject = replace(subject_of(run, finished=False), embedded=bool(command.token))
     if run.photographed:
         subject = replace(subject, open_scene=lambda: data)
     address = choose_address(command.host, command.port, command.token)

@@ -22,6 +22,7 @@ from .splatting import view_of
 MAX_DEGREE = 3
 RADIUS_DEVIATIONS = 3.33  # of a footprint at most, as meta["radii"] counts; there exp(-r^2 / 2) is 1/255
 MIN_OPACITY = 1e-10  # of a pixel whose depth is divided by it
+FOOTPRINT = "means2d", "conics", "opacities", "depths"  # entries of the dictionary that are composited
 MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
 
@@ -117,11 +118,9 @@ def rasterization(
         cameras, gaussians = (radii > 0).all(-1).nonzero().unbind(-1)
         meta = {name: value if value is None else value[cameras, gaussians] for name, value in meta.items()}
         meta |= {"batch_ids": torch.zeros_like(cameras), "camera_ids": cameras, "gaussian_ids": gaussians}
-        rows = [gaussians[cameras == i] for i in range(count)]
-        shares = [int((cameras == i).sum()) for i in range(count)]
-    parts = [
-        meta[name].split(shares) if packed else meta[name] for name in ("means2d", "conics", "opacities", "depths")
-    ]
+        shares = torch.bincount(cameras, minlength=count).tolist()
+        rows = list(gaussians.split(shares))
+    parts = [meta[name].split(shares) if packed else meta[name] for name in FOOTPRINT]
 
     pictures, opaque = [], []
     for i in range(count):

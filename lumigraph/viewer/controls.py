@@ -42,7 +42,7 @@ class Controls:
             hint = "Pixels along the longer side, once the camera rests"
             self._sharpest = gui.add_slider("Resolution", 240, 2048, 16, DEFAULT_RESOLUTION, hint=hint)
             self._background = gui.add_rgb("Background", to_bytes(self._own))
-            self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
+            self._cameras = gui.add_checkbox("Cameras", not shared.subject.embedded, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
             hint = "Fly back where the camera rests beyond the limits of the exported page"
             self._stays = gui.add_checkbox("Stay near the scene", True, hint=hint)

@@ -91,6 +91,7 @@ class Subject:
     behind:         sky colours and floor of an unbounded scene
     exporter:       exports the scene; None if nothing can be exported
     set_scale:      stores units of exports per unit of the photographs' frame; None in training
+    embedded:       whether it is a part of the app's page: dark as its stage, the panel folded, no frusta at first
     """
 
     title: str
@@ -106,6 +107,12 @@ class Subject:
     behind: Backdrop | None = None
     exporter: Exporter | None = None
     set_scale: Callable[[float], None] | None = None
+    embedded: bool = False
+
+    @property
+    def label(self) -> str:
+        """Heading of the panel."""
+        return "Controls" if self.embedded else self.title
 
     @cached_property
     def around(self) -> Surroundings:

@@ -154,7 +154,7 @@ class Viewer:
         self._visitors: dict[int, Visitor] = {}
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
-        self._server = start_server(address, subject.title, subject.page)
+        self._server = start_server(address, subject.label, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
         selects = subject.open_scene is not None and not training
@@ -177,8 +177,11 @@ class Viewer:
     def _aim(self) -> None:
         """Set the appearance of the page, and the initial camera of every client."""
         server, subject = self._server, self.subject
-        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        prepare_window(server.gui, subject.title)
+        width, dark = ("small", True) if subject.embedded else ("medium", False)
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width=width, dark_mode=dark)
+        if subject.embedded:
+            server.gui.main_panel.minimize()
+        prepare_window(server.gui, subject.label)
         # No environment map: nothing here is lit, and viser fades the canvas in over frames once it has loaded
         server.scene.configure_environment_map(None)
         opening = subject.opening
