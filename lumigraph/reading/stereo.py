@@ -93,8 +93,7 @@ def disparity(costs: Costs) -> Grey:
 def main() -> None:
     images, poses, focal = photographs("train", SCENE)
     left, right = poses[FIRST], poses[SECOND]
-    exchanged = float((right[:, 3] - left[:, 3]) @ left[:, 0]) < 0
-    pair = (SECOND, FIRST) if exchanged else (FIRST, SECOND)
+    pair = (FIRST, SECOND) if (right[:, 3] - left[:, 3]) @ left[:, 0] > 0 else (SECOND, FIRST)
     left, right = (poses[i] for i in pair)
     rotation, baseline = shared_rotation(left, right), float((right[:, 3] - left[:, 3]).norm())
     pictures = [rectified(images[i], poses[i], rotation, focal) for i in pair]
@@ -112,7 +111,8 @@ def main() -> None:
         f"baseline {baseline:.3f}, focal length {focal:.0f} px, disparities {found.min():.1f} to {found.max():.1f} px"
     )
     print(f"median depth error {100 * error.median():.1f} %, beyond 10 % at {100 * (error > 0.1).float().mean():.0f} %")
-    shown = [(0.6 / x.clamp_min(0.1))[..., None].expand(-1, -1, 3) for x in (z, turned)]
+    nearest, inside = turned[known].min(), (pictures[0].amax(2) > 0)[..., None]
+    shown = [torch.where(inside, nearest / x[..., None], 0).expand(-1, -1, 3) for x in (z, turned)]
     save("stereo", *pictures, *shown)
 
 
