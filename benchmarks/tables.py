@@ -222,7 +222,7 @@ def by_seconds(cells: Sequence[Row], page: Path) -> list[str]:
 
 
 def by_program(cells: Sequence[Row], page: Path) -> list[str]:
-    """Programs of the reading edition, and the same work with the package's kernels; what is not measured is empty."""
+    """Programs of the reading edition, and the same work with the package's kernels, in columns with figures."""
     rows = [
         ["program", "lines", "s", "result", "s, kernels", "result", "operation", "ms", "ms, kernel", "times as fast"]
     ]
@@ -238,7 +238,8 @@ def by_program(cells: Sequence[Row], page: Path) -> list[str]:
             own, its = row["ms"], row["kernel_ms"]
             told += [f"`{row['operation']}`", f"{own:.1f}", f"{its:.2f}", f"{own / its:.1f}"]
         rows.append(told + [""] * (len(rows[0]) - len(told)))
-    return markdown(rows)
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
+    return markdown(list(zip(*columns, strict=True)))
 
 
 def headline(row: Row) -> str:
