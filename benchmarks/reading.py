@@ -40,6 +40,7 @@ from lumigraph.kernels.factor_grid import Factors
 from lumigraph.kernels.hash_encode import HashLevels
 from lumigraph.kernels.octree_cells import Tree
 from lumigraph.methods.neus.fields import NeuSField
+from lumigraph.training.display import machine
 
 ROOT = Path(__file__).parent.parent
 FOLDER, RESULTS = ROOT / "lumigraph" / "reading", ROOT / "benchmarks" / "results" / "reading-cpu.json"
@@ -297,7 +298,7 @@ def write(commit: str, name: str, row: dict[str, Any]) -> None:
     seen = {key for one in rows.values() for key in one}
     found = {
         "commit": commit,
-        "machine": "cpu, AMD EPYC, one thread, beside other programs",
+        "machine": machine(torch.device("cpu")),
         "cells": [rows[x] for x in NAMES if x in rows],
     }
     found["commands"] = [f"python benchmarks/reading.py --{x} COMMIT" for x, key in KINDS.items() if key in seen]
