@@ -70,12 +70,12 @@ def field() -> nn.ModuleDict:
 
 
 def query(net: nn.ModuleDict, points: Points, d: Float[Tensor, "sample 3"]):
-    """Density per scene unit, an exponential that is a tenth where nothing is learnt, and colour."""
+    """Density per scene unit, the exponential of the first feature, and colour."""
     low, high = BOX
     cube = (points - low) / (high - low).max()
     features = net["density"](encode(cube, list(net["tables"]), resolutions(LEVELS, COARSEST, FINEST)))
     inside = ((points > low) & (points < high)).all(1)
-    sigma = torch.exp(features[:, 0].clamp(max=10) - 2.3) * inside
+    sigma = torch.exp(features[:, 0].clamp(max=8)) * inside
     return sigma, net["colour"](torch.cat([features, directional(d)], 1)).sigmoid()
 
 
@@ -138,13 +138,13 @@ def train(net: nn.ModuleDict, o: Tensor, d: Tensor, truth: Tensor, steps: int = 
     begin = time.perf_counter()
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = RATE * 0.05 ** max(0.0, (step / steps - 0.3) / 0.7)
-        chosen = torch.randint(len(o), (RAYS if step > 50 else RAYS // 5,))
+        chosen = torch.randint(len(o), (RAYS if step > 75 else RAYS // 4,))
         rgb, _ = render(net, o[chosen], d[chosen], occupied, jitter=True)
         loss = (rgb - truth[chosen]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if step % 25 == 24 and step > 40:
+        if step % 25 == 24 and step > 50:
             occupied = occupancy(net, step_length)
         if step % 50 == 49:
             filled = 100 * float(occupied.float().mean())
