@@ -111,7 +111,7 @@ def main() -> None:
         f"baseline {baseline:.3f}, focal length {focal:.0f} px, disparities {found.min():.1f} to {found.max():.1f} px"
     )
     print(f"median depth error {100 * error.median():.1f} %, beyond 10 % at {100 * (error > 0.1).float().mean():.0f} %")
-    nearest, inside = turned[known].min(), (pictures[0].amax(2) > 0)[..., None]
+    nearest, inside = turned[known].quantile(0.02), (pictures[0].amax(2) > 0)[..., None]
     shown = [torch.where(inside, nearest / x[..., None], 0).expand(-1, -1, 3) for x in (z, turned)]
     save("stereo", *pictures, *shown)
 
