@@ -16,6 +16,7 @@ export function Photographs({ detail, states, advice, choose, act, marked }) {
     ? Object.keys(states).map((name) => ({ name, version: detail.result ? "made" : "now" }))
     : detail.photographs;
   const stateFor = (name) => states[name] || states[safe(name)] || {};
+  const turn = (step) => setOpen(named[(named.findIndex((one) => one.name === open.name) + step + named.length) % named.length]);
   return html`<div class="pad">
     ${own && html`<div class="row">
       <label class="button">Add photographs<input type="file" multiple accept="image/*,video/*,.heic,.heif,.dng,.nef,.cr2,.cr3,.arw" onChange=${(event) => choose(event.target.files, detail.key)} /></label>
@@ -38,7 +39,7 @@ export function Photographs({ detail, states, advice, choose, act, marked }) {
         open=${() => setOpen(one)} />`)}
     </ul>
     ${!named.length && !sending && html`<p class="faint">Drop photographs, a folder or a video here.</p>`}
-    ${open && html`<${Large} detail=${detail} one=${open} state=${stateFor(open.name)} close=${() => setOpen(null)} act=${act} own=${own} />`}
+    ${open && html`<${Large} key=${open.name} detail=${detail} one=${open} state=${stateFor(open.name)} close=${() => setOpen(null)} turn=${turn} act=${act} own=${own} />`}
   </div>`;
 }
 
@@ -77,8 +78,8 @@ function Photograph({ item, one, state, warned, marked, open }) {
   </button></li>`;
 }
 
-// A photograph, large, with the details that were found in it.
-function Large({ detail, one, state, close, act, own }) {
+// A photograph, large, with the details that were found in it; arrow keys turn to its neighbours.
+function Large({ detail, one, state, close, turn, act, own }) {
   const dialog = useRef(null);
   const canvas = useRef(null);
   const [features, setFeatures] = useState([]);
@@ -101,7 +102,11 @@ function Large({ detail, one, state, close, act, own }) {
     close();
   };
   const why = state.left_out || state.blurred || (state.duplicates ? `shows the same as ${state.duplicates}` : "");
-  return html`<dialog ref=${dialog} class="large" onClose=${close} aria-label=${one.name}>
+  const keys = (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (step) turn(step);
+  };
+  return html`<dialog ref=${dialog} class="large" onClose=${close} onKeyDown=${keys} aria-label=${one.name}>
     <div class="picture"><img alt=${one.name} src=${pictureUrl(detail.key, { name: one.name, side: 1400, v: one.version })} onLoad=${draw} /><canvas ref=${canvas} aria-hidden="true"></canvas></div>
     <p>${one.name}${state.features ? ` · ${state.features.toLocaleString()} details` : ""}${state.placed ? " · placed" : ""}</p>
     ${why && html`<p class="fault">${why}</p>`}
