@@ -7,8 +7,9 @@
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
-choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`;
-`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
+`table: reading` of `reading.py --publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and
+the commands of those rows.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from lumigraph.metrics import scores_of
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
 GALLERY, STRANGERS = RESULTS.with_name("gallery-cpu.json"), RESULTS.with_name("strangers-cpu.json")
-MINUTE = RESULTS.with_name("one-minute-cpu.json")
+MINUTE, READING = RESULTS.with_name("one-minute-cpu.json"), RESULTS.with_name("reading-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 GUIDES = {  # pages about sections of the gallery, in docs/
@@ -69,7 +70,7 @@ class Options:
 def read() -> dict[str, Any]:
     """Results of `lumigraph bench methods`, and of other programs as parts of them."""
     results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
-    others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE}
+    others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE, "reading": READING}
     return results | {name: json.loads(path.read_text("utf-8")) for name, path in others.items()}
 
 
@@ -220,6 +221,27 @@ def by_seconds(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
+def by_program(cells: Sequence[Row], page: Path) -> list[str]:
+    """Programs of the reading edition, and the same work with the package's kernels, in columns with figures."""
+    rows = [
+        ["program", "lines", "s", "result", "s, kernels", "result", "operation", "ms", "ms, kernel", "times as fast"]
+    ]
+    for row in cells:
+        whole = [row.get("figure", ""), f"{row['kernel_seconds']:.0f}" if "kernel_seconds" in row else ""]
+        told = [
+            f"[{row['name']}](#{row['name']})",
+            f"{row['lines']}",
+            f"{row['seconds']:.0f}" if "seconds" in row else "",
+        ]
+        told += [*whole, row.get("kernel_figure", "")]
+        if "operation" in row:
+            own, its = row["ms"], row["kernel_ms"]
+            told += [f"`{row['operation']}`", f"{own:.1f}", f"{its:.2f}", f"{own / its:.1f}"]
+        rows.append(told + [""] * (len(rows[0]) - len(told)))
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
+    return markdown(list(zip(*columns, strict=True)))
+
+
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
     score = next(iter(scores_of(row)))
@@ -240,12 +262,14 @@ KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "gallery": by_showpiece,
     "strangers": by_verdict,
     "minute": by_seconds,
+    "reading": by_program,
 }
 OTHERS = {
     "sections": "gallery",
     "gallery": "gallery",
     "strangers": "strangers",
     "minute": "minute",
+    "reading": "reading",
 }  # where the figures of a table are
 
 
