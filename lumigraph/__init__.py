@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
     from .gaussians.rasterization import rasterization as rasterization
+    from .gsplat import rasterization_2dgs as rasterization_2dgs
     from .large import open_any as open_any
     from .method import Method as Method
     from .method import RayMethod as RayMethod
@@ -76,6 +77,7 @@ _homes = {
     "open_dataset": "opening",
     "open_scene": "opening",
     "rasterization": "gaussians.rasterization",
+    "rasterization_2dgs": "gsplat.rendering",
     "train": "api",
 }
 __all__ = sorted(_homes)

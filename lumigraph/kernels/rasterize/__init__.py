@@ -39,7 +39,9 @@ def rasterize(
     require_starts("tiles.starts", tiles.starts, len(tiles.order))
     require_indices("tiles.order", tiles.order, len(centres))
     require(spread is None or spread.shape == centres.shape, "spread must have the shape of the centres")
-    return implementation("rasterize", centres)(centres, conics, opacities, colours, depths, tiles, stop, exclusive, spread)
+    return implementation("rasterize", centres)(
+        centres, conics, opacities, colours, depths, tiles, stop, exclusive, spread
+    )
 
 
 def cases(generator: torch.Generator):

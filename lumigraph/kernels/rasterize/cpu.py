@@ -320,7 +320,9 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop, exclu
 def backward(ctx, *grads):
     (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
     n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
-    _backward(*(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums, ctx.spread)
+    _backward(
+        *(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums, ctx.spread
+    )
     results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
     _gather(sums, masks, order, rows, saved[3], get_num_threads(), *(x.numpy() for x in results), ctx.spread)
     return *results, None, None, None, None
