@@ -18,7 +18,7 @@ from ..geometry import to_matrix
 from ..kernels.project import MIN_ALPHA
 from .splatting import IMAGE_MARGIN
 
-CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
+CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS = "pinhole", "ortho", "fisheye"
 RADIUS_DEVIATIONS = 3.33  # of a footprint at most; there exp(-r^2 / 2) is 1/255
 MIN_COMPENSATION = 0.005  # floor of the factor on opacity that `compensation` gives

@@ -132,12 +132,22 @@ class Views:
     def projected(self, image: int, how: Projecting) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Centres, conics, depths, opacities and radii of one image."""
         b, c = self.place(image)
-        lens = Distortion(**{name: None if x is None else x[b, c] for name, x in self.lenses.items()})
-        quats, scales, covars = (None if x is None else x[b] for x in (self.quats, self.scales, self.covars))
-        K, skewed = self.Ks[b, c], bool(self.Ks[b, c, 0, 1] != 0)
-        given = self.means[b], quats, scales, covars, self.opacities[b], self.viewmats[b, c], K, how
-        plain = how.model == "pinhole" and how.transform is None and covars is None and not skewed
-        return by_kernel(*given) if plain else by_definition(*given, lens)
+        means, quats, scales, covars, opacities = self.cloud(b)
+        viewmat, K = self.viewmats[b, c], self.Ks[b, c]
+        if how.model == "pinhole" and how.transform is None and covars is None and K[0, 1] == 0:
+            assert quats is not None and scales is not None and opacities is not None
+            return by_kernel(means, quats, scales, opacities, viewmat, K, how)
+        return by_definition(means, quats, scales, covars, opacities, viewmat, K, how, self.lens(image))
+
+    def cloud(self, batch: int) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+        """Means, quats, scales, covars and opacities."""
+        own = (None if x is None else x[batch] for x in (self.quats, self.scales, self.covars, self.opacities))
+        return self.means[batch], *own  # type: ignore[return-value]
+
+    def lens(self, image: int) -> Distortion:
+        """Distortion of one image."""
+        b, c = self.place(image)
+        return Distortion(**{name: None if x is None else x[b, c] for name, x in self.lenses.items()})
 
 
 @at_work()
@@ -332,7 +342,6 @@ def by_kernel(
     means: Float[Tensor, "gaussian 3"],
     quats: Float[Tensor, "gaussian 4"],
     scales: Float[Tensor, "gaussian 3"],
-    covars: None,
     opacities: Float[Tensor, " gaussian"],
     viewmat: Float[Tensor, "4 4"],
     K: Float[Tensor, "3 3"],

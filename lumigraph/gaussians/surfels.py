@@ -88,7 +88,7 @@ def composited_discs(
         x = torch.arange(tiles.side, device=rows.device) + k % tiles.across * tiles.side
         y = torch.arange(tiles.side, device=rows.device) + k // tiles.across * tiles.side
         pixels = torch.cartesian_prod(y[y < height], x[x < width]).flip(-1)
-        parts.append(checkpoint(_tile, pixels, *(t[rows] for t in tensors), use_reentrant=False))  # type: ignore[arg-type]
+        parts.append(checkpoint(_tile, pixels, *(t[rows] for t in tensors), use_reentrant=False))
         places.append(pixels[:, 1] * width + pixels[:, 0])
     whole = values.new_zeros(height * width, channels).index_copy(0, torch.cat(places), torch.cat(parts))
     whole = whole.view(height, width, channels)

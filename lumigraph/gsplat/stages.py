@@ -143,13 +143,13 @@ def _projected(views: Views, how: Projecting, packed: bool) -> tuple[Any, ...]:
     found = []
     for i in range(len(views)):
         b, c = views.place(i)
-        lens = Distortion(**{name: None if x is None else x[b, c] for name, x in views.lenses.items()})
-        rows = (None if x is None else x[b] for x in (views.quats, views.scales, views.covars, views.opacities))
+        means, quats, scales, covars, opacities = views.cloud(b)
+        camera = views.viewmats[b, c], views.Ks[b, c]
         centres, conics, depths, alphas, radii = by_definition(
-            views.means[b], *rows, views.viewmats[b, c], views.Ks[b, c], how, lens
+            means, quats, scales, covars, opacities, *camera, how, views.lens(i)
         )
-        if views.opacities is not None:
-            alphas = alphas / views.opacities[b].clamp_min(1e-12)
+        if opacities is not None:  # the factors that they were multiplied by
+            alphas = alphas / opacities.clamp_min(1e-12)
         found.append((radii, centres, depths, conics, alphas))
     columns = [torch.stack(x) for x in zip(*found, strict=True)]
     if not packed:

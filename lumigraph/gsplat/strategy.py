@@ -316,7 +316,7 @@ def compute_relocation(
     turns = torch.nn.functional.pad(zeros, (1, 0), value=1.0)
     plain = Gaussians(zeros, turns, scales.log(), opacities.logit(), zeros[:, None])
     found = shared_out(plain, ratios.clamp(min=1), min_opacity)
-    return found.opacities.sigmoid(), found.log_scales.exp()
+    return found.opacities.sigmoid().clamp_min(min_opacity), found.log_scales.exp()
 
 
 @torch.no_grad()
