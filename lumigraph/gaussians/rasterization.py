@@ -452,6 +452,21 @@ def camera_of(viewmat: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], w
     return Camera(pose[None], lens, torch.tensor([[width, height]], device=pose.device))
 
 
+def matrices_of(
+    cameras: Camera,
+) -> tuple[Float[Tensor, "camera 4 4"], Float[Tensor, "camera 3 3"]]:
+    """World-to-camera matrices and intrinsics of pinhole cameras, for `rasterization`."""
+    lens = cameras.lens
+    if not isinstance(lens, Pinhole):
+        raise LumigraphError(f"rasterization() has intrinsics alone, and these cameras are {type(lens).__name__}; undistort")
+    rotation = cameras.pose[:, :, :3].mT
+    viewmats, Ks = (torch.eye(n, device=rotation.device).repeat(len(rotation), 1, 1) for n in (4, 3))
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3:] = -rotation @ cameras.pose[:, :, 3:]
+    Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = lens.focal, lens.centre
+    return viewmats, Ks
+
+
 def in_camera(
     means: Float[Tensor, "gaussian 3"], quats: Float[Tensor, "gaussian 4"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"]]:

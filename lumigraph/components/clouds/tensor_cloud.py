@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
-from .adaptive import AdaptiveDensity, AdaptiveNumbers
-from .density_control import RefineNumbers
+from .adaptive import RECOVERY_INTERVALS, AdaptiveDensity, AdaptiveNumbers
+from .density_control import PRUNE_OPACITY, RefineNumbers
 from .error_density import ErrorDensity
 
 REQUIRED = ("means", "quats", "scales", "opacities")
@@ -96,16 +96,6 @@ def _moved(moment: Tensor, source: Tensor, fresh: Tensor, count: int) -> Tensor:
     return moment
 
 
-class Strategy(Protocol):
-    """Density control by functions: before the backward pass, and after the optimizers' steps."""
-
-    def initialize_state(self, count: int, extent: float = 1.0) -> dict[str, Any]: ...
-
-    def step(
-        self, params: Params, optimizers: Optimizers, state: dict[str, Any], number: int, info: dict[str, Any]
-    ) -> None: ...
-
-
 @dataclass(frozen=True)
 class DensitySteps:
     """Our density control as functions of dictionaries: adaptive (Kerbl 2023) or by error (Mallick 2024).
@@ -132,7 +122,7 @@ class DensitySteps:
 
     @torch.no_grad()
     def step(
-        self, params: Params, optimizers: Optimizers, state: dict[str, Any], number: int, info: dict[str, Any]
+        self, params: Params, optimizers: Optimizers, state: dict[str, Any], number: int, info: Mapping[str, Any]
     ) -> bool:
         """Follow a step after its backward pass, and change the Gaussians where that is due. True if it did."""
         control, progress = state["control"], number / self.steps
@@ -144,25 +134,27 @@ class DensitySteps:
         if due:
             share = min(1.0, progress / self.refine.refine_until) ** control.ramp if self.refine.cap_ramp else 1.0
             first = int(control.initial_count)
-            control.refine(cloud, state["extent"], int(first + share * max(self.cap - first, 0)), state["random"])
+            cap = int(first + share * max(self.cap - first, 0))
+            control.refine(cloud, state["extent"], cap, state["random"])  # type: ignore[arg-type]
             for name in control.grows:
                 setattr(control, name, getattr(control, name).new_zeros(len(cloud)))
         every = self.numbers.opacity_reset_interval
-        if self.kind == "adaptive" and number and number % every == 0 and self.steps - number >= 3 * every:
-            cloud.reset_opacity(2 * 0.005)
+        if self.kind == "adaptive" and number and number % every == 0 and self.steps - number >= RECOVERY_INTERVALS * every:
+            cloud.reset_opacity(2 * PRUNE_OPACITY)
         return due
 
-    def record(self, control: AdaptiveDensity, info: dict[str, Any], count: int) -> None:
+    def record(self, control: AdaptiveDensity, info: Mapping[str, Any], count: int) -> None:
         """Add one step's gradients, of all cameras in the dictionary."""
-        centres, radii, ids = info["means2d"], info["radii"], info.get("gaussian_ids")
         if self.kind == "error":
+            assert isinstance(control, ErrorDensity)
             control.explained += info["explained"].grad.view(-1, count).sum(0)
             return
+        centres, ids = info["means2d"], info.get("gaussian_ids")
         if centres.grad is None:
             raise LumigraphError("means2d has no gradient; call info['means2d'].retain_grad() before the backward pass")
+        gradient = centres.grad * centres.new_tensor([info["width"], info["height"]]) / 2 * info["n_cameras"]
         if ids is None:
-            seen = (radii.view(-1, count, 2) > 0).all(-1)
-            control.record(centres.grad.view(-1, count, 2).sum(0), seen.any(0), (info["width"], info["height"]))
-            return
-        gradient = centres.grad.new_zeros(count, 2).index_add(0, ids, centres.grad)
-        control.record(gradient, torch.bincount(ids, minlength=count) > 0, (info["width"], info["height"]))
+            seen = (info["radii"] > 0).all(-1)
+            ids, gradient = seen.nonzero()[:, -1], gradient[seen]
+        control.positional_gradient_sum.index_add_(0, ids, gradient.norm(dim=-1))
+        control.visible_count.index_add_(0, ids, torch.ones_like(gradient[:, 0]))
