@@ -66,7 +66,7 @@ def pytest_configure(config: Any) -> None:
             if hasattr(module, name):
                 setattr(module, name, getattr(ours, name))
     for module in (gsplat, wrapper):
-        module.rasterize_to_indices_in_range = indices_in_range
+        module.rasterize_to_indices_in_range = module.rasterize_to_indices_in_range_2dgs = indices_in_range
     gsplat.rendering.rasterization = rendering.rasterization
     for name in ("relocate", "sample_add", "duplicate", "split", "remove", "reset_opa", "inject_noise_to_position"):
         setattr(ops, name, getattr(strategy, name))
@@ -126,7 +126,7 @@ def indices_in_range(
     last: int,
     transmittances: Tensor,
     means2d: Tensor,
-    conics: Tensor,
+    shapes: Tensor,
     opacities: Tensor,
     width: int,
     height: int,
@@ -134,11 +134,16 @@ def indices_in_range(
     offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussians, pixels and images of the pairs that count, all of them at once."""
+    """Gaussians, pixels and images of the pairs that count, all of them at once.
+
+    shapes: conics, or ray transforms of discs
+    """
     if first > 0:
         return (torch.zeros(0, dtype=torch.int64),) * 3
     count, found = means2d.shape[-2], []
-    centres, shapes, alphas = means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.reshape(-1)
+    discs = shapes.ndim == means2d.ndim + 1
+    centres, alphas = means2d.reshape(-1, 2), opacities.reshape(-1)
+    shapes = shapes.reshape(-1, 3, 3) if discs else shapes.reshape(-1, 3)
     starts = torch.cat([offsets.flatten().long(), torch.tensor([len(flatten_ids)])])
     down, across = offsets.shape[-2:]
     for k in (starts.diff() > 0).nonzero()[:, 0].tolist():
@@ -147,8 +152,15 @@ def indices_in_range(
         y, x = (torch.arange(side) + n * side for n in divmod(tile, across))
         pixels = torch.cartesian_prod(y[y < height], x[x < width])
         d = pixels.flip(-1)[:, None] + 0.5 - centres[ids]
-        a, b, c = shapes[ids].unbind(-1)
-        sigma = 0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) + b * d[..., 0] * d[..., 1]
+        if discs:
+            u, v, w = shapes[ids].unbind(1)
+            at = pixels.flip(-1)[:, None] + 0.5
+            cross = torch.linalg.cross(at[..., :1] * w - u, at[..., 1:] * w - v)
+            apart = (cross[..., :2] / cross[..., 2:]).square().sum(-1)
+            sigma = 0.5 * torch.minimum(apart, 2 * d.square().sum(-1))
+        else:
+            a, b, c = shapes[ids].unbind(-1)
+            sigma = 0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) + b * d[..., 0] * d[..., 1]
         alpha = (alphas[ids] * torch.exp(-sigma)).clamp(max=0.99)
         alpha = torch.where((alpha < 1 / 255) | (sigma < 0), 0.0, alpha)
         counts = (alpha > 0) & ((1 - alpha).cumprod(1) > 1e-4)

@@ -458,7 +458,9 @@ def matrices_of(
     """World-to-camera matrices and intrinsics of pinhole cameras, for `rasterization`."""
     lens = cameras.lens
     if not isinstance(lens, Pinhole):
-        raise LumigraphError(f"rasterization() has intrinsics alone, and these cameras are {type(lens).__name__}; undistort")
+        raise LumigraphError(
+            f"rasterization() takes pinhole cameras, and these are {type(lens).__name__}; undistort them"
+        )
     rotation = cameras.pose[:, :, :3].mT
     viewmats, Ks = (torch.eye(n, device=rotation.device).repeat(len(rotation), 1, 1) for n in (4, 3))
     viewmats[:, :3, :3] = rotation

@@ -73,7 +73,12 @@ def discs_of(
 
 
 def composited_discs(
-    seen: Discs, opacities: Float[Tensor, " gaussian"], values: Float[Tensor, "gaussian channel"], tiles: Tiles
+    centres: Float[Tensor, "gaussian 2"],
+    transforms: Float[Tensor, "gaussian 3 3"],
+    normals: Float[Tensor, "gaussian 3"],
+    opacities: Float[Tensor, " gaussian"],
+    values: Float[Tensor, "gaussian channel"],
+    tiles: Tiles,
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width 6"]]:
     """Values, and beside them normal, opacity, distortion and median of the last channel.
 
@@ -82,7 +87,7 @@ def composited_discs(
     width, height = tiles.size
     channels = values.shape[1] + CHANNELS + 3
     parts, places = [values.new_zeros(0, channels)], [torch.zeros(0, dtype=torch.int64, device=values.device)]
-    tensors = seen.transforms, seen.centres, opacities, torch.cat([values, seen.normals], -1)
+    tensors = transforms, centres, opacities, torch.cat([values, normals], -1)
     for k in (tiles.starts.diff() > 0).nonzero()[:, 0].tolist():
         rows = tiles.order[tiles.starts[k] : tiles.starts[k + 1]].long()
         x = torch.arange(tiles.side, device=rows.device) + k % tiles.across * tiles.side

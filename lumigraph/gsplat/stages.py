@@ -14,14 +14,13 @@ from torch import Tensor
 from ..color.blending import over
 from ..errors import LumigraphError
 from ..gaussians.projection import (
-    Distortion,
     UnscentedTransformParameters,
     affine,
     check_model,
     covariances_of,
 )
 from ..gaussians.rasterization import Projecting, Views, by_definition, composited, harmonics
-from ..gaussians.surfels import Discs, composited_discs, discs_of
+from ..gaussians.surfels import composited_discs, discs_of
 from ..gaussians.tile_lists import tiles_of
 
 TRIANGLE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # rows and columns of the upper triangle
@@ -304,9 +303,8 @@ def rasterize_to_pixels_2dgs(
         mask = None if tiled is None else tiled[i]
         tiles, first, last = tiles_of(offsets, flatten_ids, i, (image_width, image_height), tile_size, mask)
         own = slice(first, last)
-        none = torch.zeros_like(alphas[own])
-        seen = Discs(none.int(), centres[own], none, transforms[own], towards[own])
-        picture, further = composited_discs(seen, alphas[own], values[own], tiles)
+        rows = (x[own] for x in (centres, transforms, towards, alphas, values))
+        picture, further = composited_discs(*rows, tiles)
         normal, opacity, distortion, median = further.split((3, 1, 1, 1), -1)
         if backgrounds is not None:
             picture = over(picture, opacity[..., 0], backgrounds.reshape(len(offsets), -1)[i])

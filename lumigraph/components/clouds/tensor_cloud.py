@@ -135,11 +135,16 @@ class DensitySteps:
             share = min(1.0, progress / self.refine.refine_until) ** control.ramp if self.refine.cap_ramp else 1.0
             first = int(control.initial_count)
             cap = int(first + share * max(self.cap - first, 0))
-            control.refine(cloud, state["extent"], cap, state["random"])  # type: ignore[arg-type]
+            control.refine(cloud, state["extent"], cap, state["random"])
             for name in control.grows:
                 setattr(control, name, getattr(control, name).new_zeros(len(cloud)))
         every = self.numbers.opacity_reset_interval
-        if self.kind == "adaptive" and number and number % every == 0 and self.steps - number >= RECOVERY_INTERVALS * every:
+        if (
+            self.kind == "adaptive"
+            and number
+            and number % every == 0
+            and self.steps - number >= RECOVERY_INTERVALS * every
+        ):
             cloud.reset_opacity(2 * PRUNE_OPACITY)
         return due
 
