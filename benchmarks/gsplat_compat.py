@@ -95,12 +95,20 @@ class Options:
         found: dict[str, Any] = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
         found["parameters"] = [*parameters()]
         if self.tests:
-            found["tests"] = own_tests(self.tests, self.seconds)
+            found["owntests"] = own_tests(self.tests, self.seconds)
         if self.data:
             found["trainings"] = [training(name, self) for name in self.strategies]
         print(json.dumps(found, indent=1))
         if self.publish:
             commit = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True).strip()
+            found["parameters"] = [row | {k: float(f"{row[k]:.1e}") for k in ("value", "gradient") if k in row}
+                                   for row in found["parameters"]]  # fmt: skip
+            command = "python benchmarks/gsplat_compat.py"
+            found["commands"] = {
+                "parameters": [command],
+                "owntests": [f"{command} --tests CHECKOUT"],
+                "trainings": [f"{command} --data fox --steps {self.steps} --downscale {self.downscale}"],
+            }
             found |= {"commit": commit, "machine": f"cpu, {os.cpu_count()} threads"}
             RESULTS.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
 

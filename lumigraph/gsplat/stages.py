@@ -303,7 +303,7 @@ def rasterize_to_pixels_2dgs(
         mask = None if tiled is None else tiled[i]
         tiles, first, last = tiles_of(offsets, flatten_ids, i, (image_width, image_height), tile_size, mask)
         own = slice(first, last)
-        rows = (x[own] for x in (centres, transforms, towards, alphas, values))
+        rows = centres[own], transforms[own], towards[own], alphas[own], values[own]
         picture, further = composited_discs(*rows, tiles)
         normal, opacity, distortion, median = further.split((3, 1, 1, 1), -1)
         if backgrounds is not None:
