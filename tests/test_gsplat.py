@@ -10,10 +10,11 @@ from budgets import budget
 from test_rasterization import SIZE, cameras, cloud
 
 from lumigraph import gsplat
-from lumigraph.components.clouds.tensor_cloud import DensitySteps, TensorCloud
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import to_matrix
+from lumigraph.gsplat import DensitySteps
 from lumigraph.gsplat import strategy as ops
+from lumigraph.gsplat.tensor_cloud import TensorCloud
 
 pytestmark = budget("kernels", 4)
 

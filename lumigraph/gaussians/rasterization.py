@@ -47,7 +47,7 @@ RasterizeMode = Literal["classic", "antialiased"]
 TILE_SIDE = 16  # pixels of the tiles that the dictionary lists; the kernels have their own
 
 
-class Info(dict[str, Any]):
+class SplatInfo(dict[str, Any]):
     """Dictionary of projected Gaussians. The lists of tiles are made when one of LISTS is first asked for."""
 
     LISTS: ClassVar[tuple[str, ...]] = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
@@ -88,7 +88,7 @@ class Projecting:
 
 
 @dataclass(frozen=True)
-class Views:
+class CloudViews:
     """Clouds and cameras in single precision, with one axis for the batch. dims: axes of the batch in the call"""
 
     dims: tuple[int, ...]
@@ -102,8 +102,8 @@ class Views:
     lenses: dict[str, Tensor | None]
 
     @classmethod
-    def of(cls, tensors: dict[str, Tensor | None], lenses: dict[str, Tensor | None]) -> Views:
-        """Views of a call's tensors, whose leading axes are those of the means and cameras."""
+    def of(cls, tensors: dict[str, Tensor | None], lenses: dict[str, Tensor | None]) -> CloudViews:
+        """CloudViews of a call's tensors, whose leading axes are those of the means and cameras."""
         means, viewmats = tensors["means"], tensors["viewmats"]
         assert means is not None and viewmats is not None
         dims, cameras = means.shape[:-2], viewmats.shape[-3:-2]
@@ -196,7 +196,7 @@ def rasterization(
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
     include_last: bool = False,
-) -> tuple[Float[Tensor, "*batch camera height width value"], Float[Tensor, "*batch camera height width 1"], Info]:
+) -> tuple[Float[Tensor, "*batch camera height width value"], Float[Tensor, "*batch camera height width 1"], SplatInfo]:
     """Render Gaussians for several cameras; differentiable in all tensors but `Ks` and coefficients of lenses.
 
     quats:      (w, x, y, z) of any length but zero
@@ -238,7 +238,7 @@ def rasterization(
         "covars with with_ut": covars is not None and with_ut})  # fmt: skip
     check_model(camera_model)
     shapes = (None, None) if covars is not None else (quats, scales)
-    views = Views.of({"means": means, "quats": shapes[0], "scales": shapes[1], "covars": covars,
+    views = CloudViews.of({"means": means, "quats": shapes[0], "scales": shapes[1], "covars": covars,
                       "opacities": opacities, "viewmats": viewmats, "Ks": Ks}, lenses)  # fmt: skip
     antialiased, transform = rasterize_mode == "antialiased", ut_params or UnscentedTransformParameters()
     how = Projecting((width, height), near_plane, far_plane, radius_clip, eps2d, antialiased, camera_model,
@@ -279,13 +279,13 @@ class Wants:
             raise LumigraphError(f"render_mode={self.mode!r} shows colours, and colors is None; give them, or take D")
 
 
-def information(views: Views, how: Projecting, packed: bool, side: int) -> tuple[Info, list[Any]]:
+def information(views: CloudViews, how: Projecting, packed: bool, side: int) -> tuple[SplatInfo, list[Any]]:
     """Dictionary of the projected Gaussians, and the Gaussians of each image in it."""
     columns = zip(*(views.projected(i, how) for i in range(len(views))), strict=True)
     found = {name: torch.stack(x) for name, x in zip(("means2d", "conics", "depths", "opacities", "radii"), columns,
                                                      strict=True)}  # fmt: skip
     (width, height), cameras = how.size, views.images[-1]
-    info = Info(width=width, height=height, n_cameras=cameras, n_batches=len(views.means), tile_size=side,
+    info = SplatInfo(width=width, height=height, n_cameras=cameras, n_batches=len(views.means), tile_size=side,
                 tile_width=-(-width // side), tile_height=-(-height // side), images=views.images,
                 batch_ids=None, camera_ids=None, gaussian_ids=None)  # fmt: skip
     if not packed:
@@ -298,14 +298,14 @@ def information(views: Views, how: Projecting, packed: bool, side: int) -> tuple
 
 
 def rendered(
-    views: Views,
-    info: Info,
+    views: CloudViews,
+    info: SplatInfo,
     rows: list[Any],
     colors: Tensor | None,
     extra: Tensor | None,
     backgrounds: Tensor | None,
     wants: Wants,
-) -> tuple[Tensor, Tensor, Info]:
+) -> tuple[Tensor, Tensor, SplatInfo]:
     """Pictures, opacities and the dictionary of `rasterization`."""
     shares, has_colours = [len(x) for x in rows] if wants.packed else [], "RGB" in wants.mode
 
@@ -401,7 +401,7 @@ def compensation_of(conics: Float[Tensor, "gaussian 3"], blur: float) -> Float[T
 
 
 def colours(
-    colors: Tensor, views: Views, image: int, rows: Any, degree: int | None, clamp: bool = True
+    colors: Tensor, views: CloudViews, image: int, rows: Any, degree: int | None, clamp: bool = True
 ) -> Float[Tensor, "gaussian channel"]:
     """Values of some Gaussians for one image: unchanged, or from harmonics, 1/2 + sum_k Y_k(d) h_k, at least zero.
 

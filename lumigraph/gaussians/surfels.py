@@ -25,8 +25,8 @@ CHANNELS = 3  # of a normal
 
 
 @dataclass(frozen=True)
-class Discs:
-    """Discs in one camera; rows of those that are not visible have zero radii.
+class ProjectedDiscs:
+    """ProjectedDiscs in one camera; rows of those that are not visible have zero radii.
 
     transforms: rows u, v, w of the map from a disc's (s, t, 1) to homogeneous pixels
     normals:    towards the camera, in its frame
@@ -49,7 +49,7 @@ def discs_of(
     near: float = 0.01,
     far: float = 1e10,
     radius_clip: float = 0.0,
-) -> Discs:
+) -> ProjectedDiscs:
     """Project discs; the third scale is not used (section 4.1, and the bounds of eqs. 9 to 11)."""
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     axes = viewmat[:3, :3] @ to_matrix(quats)
@@ -69,7 +69,7 @@ def discs_of(
     shown = visible[:, None]
     transforms = torch.where(shown[..., None], transforms, 0.0)
     centres, normals = torch.where(shown, centres, 0.0), torch.where(shown, normals, 0.0)
-    return Discs((reach * shown).int(), centres, torch.where(visible, z, 0.0), transforms, normals)
+    return ProjectedDiscs((reach * shown).int(), centres, torch.where(visible, z, 0.0), transforms, normals)
 
 
 def composited_discs(

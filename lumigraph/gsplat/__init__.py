@@ -16,10 +16,12 @@ from .stages import (
     world_to_cam,
 )
 from .strategy import DefaultStrategy, MCMCStrategy, Strategy
+from .tensor_cloud import DensitySteps
 
 __all__ = [
     "CameraModel",
     "DefaultStrategy",
+    "DensitySteps",
     "MCMCStrategy",
     "RasterizeMode",
     "RenderMode",

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ..errors import LumigraphError
-from ..gaussians.rasterization import MIN_OPACITY, MODES, Info, RasterizeMode, RenderMode, rasterization
+from ..gaussians.rasterization import MIN_OPACITY, MODES, RasterizeMode, RenderMode, SplatInfo, rasterization
 from ..gaussians.surfels import normals_from_depth
 from ..gaussians.tile_lists import isect_offset_encode, isect_tiles
 from .stages import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs, spherical_harmonics
@@ -42,7 +42,7 @@ def rasterization_2dgs(
     absgrad: bool = False,
     distloss: bool = False,
     depth_mode: str = "expected",
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Info]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, SplatInfo]:
     """Render 2-D Gaussians (Huang 2024): colours, opacities, normals, normals of the depth, distortion, median depth.
 
     Parameters are those of `rasterization`; eps2d has no effect, as in gsplat. Normals are in the world. Those of the
@@ -84,11 +84,11 @@ def rasterization_2dgs(
         z = median[..., 0] if depth_mode == "median" else picture[..., -1]
         each = zip(z.flatten(0, -3), viewmats.flatten(0, -3), Ks.flatten(0, -3), strict=True)
         surfaces = torch.stack([normals_from_depth(*x) for x in each]).view_as(normal)
-    info = Info(ids, radii=radii, means2d=centres, depths=depths, ray_transforms=transforms, opacities=alphas,
+    info = SplatInfo(ids, radii=radii, means2d=centres, depths=depths, ray_transforms=transforms, opacities=alphas,
                 normals=normals, isect_offsets=offsets, width=width, height=height, tile_size=tile_size,
                 tile_width=grid[0], tile_height=grid[1], n_cameras=cameras, n_batches=prod(lead),
                 render_distort=distortion, gradient_2dgs=densify)  # fmt: skip
-    info |= zip(Info.LISTS, tiles, strict=False)
+    info |= zip(SplatInfo.LISTS, tiles, strict=False)
     world = normal @ viewmats[..., None, :3, :3].to(normal)
     return picture, opacity, world, surfaces, distortion, median, info
 

@@ -19,7 +19,7 @@ from ..gaussians.projection import (
     check_model,
     covariances_of,
 )
-from ..gaussians.rasterization import Projecting, Views, by_definition, composited, harmonics
+from ..gaussians.rasterization import CloudViews, Projecting, by_definition, composited, harmonics
 from ..gaussians.surfels import composited_discs, discs_of
 from ..gaussians.tile_lists import tiles_of
 
@@ -101,7 +101,7 @@ def fully_fused_projection(
              "viewmats": viewmats, "Ks": Ks}  # fmt: skip
     how = Projecting((width, height), near_plane, far_plane, radius_clip, eps2d, calc_compensations, camera_model,
                      None, False)  # fmt: skip
-    return _projected(Views.of(given, {}), how, packed)
+    return _projected(CloudViews.of(given, {}), how, packed)
 
 
 def fully_fused_projection_with_ut(
@@ -135,10 +135,10 @@ def fully_fused_projection_with_ut(
     lenses = {"radial": radial_coeffs, "tangential": tangential_coeffs, "thin_prism": thin_prism_coeffs}
     how = Projecting((width, height), near_plane, far_plane, radius_clip, eps2d, calc_compensations, camera_model,
                      ut_params or UnscentedTransformParameters(), not global_z_order)  # fmt: skip
-    return _projected(Views.of(given, lenses), how, False)
+    return _projected(CloudViews.of(given, lenses), how, False)
 
 
-def _projected(views: Views, how: Projecting, packed: bool) -> tuple[Any, ...]:
+def _projected(views: CloudViews, how: Projecting, packed: bool) -> tuple[Any, ...]:
     found = []
     for i in range(len(views)):
         b, c = views.place(i)
@@ -177,7 +177,7 @@ def fully_fused_projection_2dgs(
     sparse_grad: bool = False,
 ) -> tuple[Any, ...]:
     """Radii, centres, depths, ray transforms and normals of discs; packed as in `fully_fused_projection`."""
-    views = Views.of({"means": means, "quats": quats, "scales": scales, "covars": None, "opacities": None,
+    views = CloudViews.of({"means": means, "quats": quats, "scales": scales, "covars": None, "opacities": None,
                       "viewmats": viewmats, "Ks": Ks}, {})  # fmt: skip
     found = []
     for i in range(len(views)):

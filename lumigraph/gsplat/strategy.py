@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..components.clouds.adaptive import SPLIT_FACTOR
-from ..components.clouds.tensor_cloud import REQUIRED, Optimizers, Params, TensorCloud
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..gaussians.projection import covariances_of
 from ..geometry import to_matrix
 from ..methods.gaussian_splatting.mcmc import GROWTH_FACTOR, MAX_COPIES, shared_out
+from .tensor_cloud import REQUIRED, Optimizers, Params, TensorCloud
 
 State = dict[str, Any]
 

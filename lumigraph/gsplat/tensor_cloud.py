@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...errors import LumigraphError
-from ...gaussians import Gaussians
-from .adaptive import RECOVERY_INTERVALS, AdaptiveDensity, AdaptiveNumbers
-from .density_control import PRUNE_OPACITY, RefineNumbers
-from .error_density import ErrorDensity
+from ..components.clouds.adaptive import RECOVERY_INTERVALS, AdaptiveDensity, AdaptiveNumbers
+from ..components.clouds.density_control import PRUNE_OPACITY, RefineNumbers
+from ..components.clouds.error_density import ErrorDensity
+from ..errors import LumigraphError
+from ..gaussians import Gaussians
 
 REQUIRED = ("means", "quats", "scales", "opacities")
 Params = MutableMapping[str, Any]  # or a torch.nn.ParameterDict
