@@ -1,4 +1,4 @@
-"""What a minute on a processor gives: captures, budgets of seconds, seeds and methods, with the spread over seeds.
+"""A minute on a processor: captures, budgets of seconds, seeds and methods, with the spread over seeds.
 
     python benchmarks/one_minute.py DATA OUTPUT                                 all of SCENES that DATA has
     python benchmarks/one_minute.py DATA OUTPUT --scenes fox /photographs/cat   these, and captures of your own
@@ -59,10 +59,9 @@ def main(options: Options) -> None:
     for row in rows:
         print(json.dumps(row))
     if options.publish:
-        words = (
-            f"--scenes {' '.join(dict.fromkeys(row['scene'] for row in rows))} --methods {' '.join(options.methods)} "
-        )
-        words += f"--seconds {' '.join(f'{x:g}' for x in options.seconds)} --seeds {' '.join(map(str, options.seeds))}"
+        told = {"scenes": dict.fromkeys(row["scene"] for row in rows), "methods": options.methods}
+        told |= {"seconds": [f"{x:g}" for x in options.seconds], "seeds": options.seeds}
+        words = " ".join(f"--{name} {' '.join(map(str, values))}" for name, values in told.items())
         about = {"commit": options.commit, "machine": rows[0]["trained_on"], "cells": rows}
         about["commands"] = [f"python benchmarks/one_minute.py DATA OUTPUT {words}"]
         RESULTS.write_text(json.dumps(about, indent=1) + "\n", "utf-8")

@@ -82,8 +82,7 @@ def least(call: Callable[[], object]) -> float:
 
 
 def figures(words: list[str], place: Path, plain: bool) -> dict:
-    """What a process writes that times kernels or steps, with Numba's code for the plainest x86-64 or for this
-    processor."""
+    """Times of kernels or steps from a process with Numba's code for the plainest x86-64, or for this processor."""
     name, result = "plain" if plain else "own", place / "result.json"
     named = {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": "+sse,+sse2"} if plain else {}
     cache = {"NUMBA_CACHE_DIR": str(place / name), "LUMIGRAPH_CACHE": str(place / f"{name}-cache")}

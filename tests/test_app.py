@@ -29,7 +29,7 @@ from starlette.websockets import WebSocketDisconnect
 from waiting import until
 from websockets.sync.server import serve as serve_websockets
 
-from lumigraph.app import folders, jobs, pictures, progress, projects, sharing, uploads
+from lumigraph.app import folders, jobs, pace, pictures, progress, projects, sharing, uploads
 from lumigraph.app.job_record import Making, change, read_job
 from lumigraph.app.jobs import child_address
 from lumigraph.app.projects import find_item, new_project
@@ -599,7 +599,8 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     )
     assert calls(app, project)[2] == ("render", {"source": place, "output": str(here / "shared" / row["name"])})
     file = running.get(f"/api/items/{project}/shares/{row['name']}")
-    assert file.content == b"<p>made</p>" and "attachment" in file.headers["Content-Disposition"]
+    assert file.content == b"<p>made</p>"
+    assert file.headers["Content-Disposition"] == f'attachment; filename="Garden{Path(row["name"]).suffix}"'
     assert "sandbox" in file.headers["Content-Security-Policy"]
     assert running.get(f"/api/items/{project}/shares/..%2fproject.json").status_code in (400, 404)
     assert running.delete(f"/api/items/{project}/shares/{row['name']}").json()["shares"] == []
@@ -669,7 +670,7 @@ def test_a_job_is_paused_and_goes_on_by_resume(app, running, project):
     until(lambda: calls(app, project))
     assert running.post(f"/api/items/{project}/make", json={}).status_code == 400  # one at a time
     running.post(f"/api/items/{project}/pause")
-    until(lambda: app.runner.current is None)
+    until(lambda: app.runner.making is None)
     assert state(running, project) == "paused" and "saved" in jobs.log_lines(find_item(app.root, project))
     let(app)
     running.post(f"/api/items/{project}/more", json={})
@@ -725,6 +726,64 @@ def test_jobs_wait_for_each_other_and_go_with_their_project(app, running):
     assert state(running, "one") == "stopped"
 
 
+def test_a_file_is_made_beside_a_training_and_a_waiting_scene_is_put_first(app, running, ball_run):
+    """Another scene's file waits for no training, its own scene's does."""
+    one, two, done = (new_project(app.root, name).key for name in ("one", "two", "done"))
+    shutil.copytree(ball_run.path, find_item(app.root, done).path / "runs" / "a")
+    for key in (one, two):
+        put(running, key, "a.jpg", jpeg())
+        running.post(f"/api/items/{key}/make", json={})
+    until(lambda: calls(app, one))
+    running.post(f"/api/items/{done}/shares", json={"kind": "mesh", "run": "a"})
+    until(lambda: calls(app, done))
+    assert state(running, one) == "running" and app.runner.running.keys() == {"make", "share"}
+    assert running.get(f"/api/items/{two}").json()["ahead"] == {"title": "one", "left": None, "between": 0}
+
+    running.post(f"/api/items/{two}/first")
+    until(lambda: calls(app, two))
+    assert (state(running, one), state(running, two)) == ("queued", "running")
+    assert "saved" in jobs.log_lines(find_item(app.root, one))
+    let(app)
+    until(lambda: state(running, one) == state(running, two) == "done")
+    assert running.get(f"/api/items/{done}").json()["shares"][0]["bytes"]
+
+
+def test_no_two_commands_work_in_one_scene(app, running, project, ball_run):
+    shutil.copytree(ball_run.path, find_item(app.root, project).path / "runs" / "a")
+    put(running, project, "a.jpg", jpeg())
+    running.post(f"/api/items/{project}/make", json={})
+    until(lambda: calls(app, project))
+    running.post(f"/api/items/{project}/shares", json={"kind": "mesh", "run": "a"})
+    with pytest.raises(TimeoutError):
+        until(lambda: len(calls(app, project)) > 1, 1)
+    let(app)
+    until(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["bytes"])
+    assert [command for command, _ in calls(app, project)] == ["capture", "train", "export mesh"]
+
+
+def test_minutes_are_told_and_follow_what_earlier_ones_took(app, client, project, ball_run, tmp_path, monkeypatch):
+    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
+    for i in range(4):
+        put(client, project, f"{i}.jpg", jpeg(i))
+    item = find_item(app.root, project)
+    first = client.get(f"/api/items/{project}/estimates").json()["gaussian-splatting"]
+    assert 0 < first["draft"] < first["good"] < first["best"]
+    pace.note_capture(item, 4 * 10.0)  # ten seconds a photograph
+    later = client.get(f"/api/items/{project}/estimates").json()["gaussian-splatting"]
+    assert later["draft"] - first["draft"] == pytest.approx(4 * (10 - pace.PER_PHOTOGRAPH) / 2, abs=1)
+    pace.note_training(Path(ball_run.path))
+    assert pace.known().step["voxel-grid"] > 0
+    (tmp_path / "cache" / "pace.json").write_text("{")
+    assert client.get(f"/api/items/{project}/estimates").json()["gaussian-splatting"] == first
+
+
+def test_a_file_that_is_being_written_is_no_version(app, project, ball_run):
+    runs = find_item(app.root, project).path / "runs"
+    shutil.copytree(ball_run.path, runs / "a")
+    shutil.copytree(ball_run.path, runs / ".lumigraph-0123456789abcdef.partial")
+    assert [path.name for path in find_item(app.root, project).runs] == ["a"]
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of a killed process")
 def test_a_killed_app_goes_on_where_it_was(app, project):
     item = find_item(app.root, project)
@@ -732,10 +791,10 @@ def test_a_killed_app_goes_on_where_it_was(app, project):
     jobs.make(item)
     app.runner.begin()
     until(lambda: calls(app, project))
-    child = app.runner.current.child
+    child = app.runner.making.child
     app.runner._ended = True  # as after a kill, nobody changes the record any more
     child.send_signal(signal.SIGKILL)
-    app.runner._thread.join(10)
+    app.runner._threads[0].join(10)
     assert read_job(item).make.state == "running"
     let(app)
     again = App(app.root, app.address, app.runner.program)

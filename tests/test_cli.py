@@ -160,6 +160,9 @@ BAD = {
     "info on nothing": ["info", "{new}/nowhere"],
     "demo into photographs": ["demo", "--output", "{photographs}"],
     "demo without frames": ["demo", "--frames", "0"],
+    "a misspelt command": ["trian", "nerf"],
+    "a word for seconds": ["train", "gaussian-splatting", "{photographs}", "--seconds", "ten"],
+    "a share of a view": ["eval", "{trained}", "--views", "1.5"],
 }
 
 
@@ -177,12 +180,33 @@ def test_bad_input_gets_one_sentence(photographs, trained, tmp_path, monkeypatch
     assert [sorted(folder.rglob("*")) for folder in folders] == before and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["trian"], ["train"], ["eval", "x", "--splot", "y"], ["train", "voxel-grid"]])
+@pytest.mark.parametrize("arguments", [["train"], ["eval", "x", "--sav-images"], ["train", "voxel-grid"], ["export"]])
 def test_bad_options_leave_with_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as fault:
         main(arguments)
     told = capsys.readouterr()
     assert fault.value.code == 2 and told.out == "" and "help" in told.err and "Traceback" not in told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (["trian"], "did you mean train?"),
+        (["train", "splat", "x"], "did you mean gaussian-splatting?"),
+        (["train", "nerf", "x", "--seconds", "ten"], "--seconds cannot be 'ten'; give it a number"),
+        (["eval", "x", "--views", "1.5"], "--views cannot be '1.5'; give it a whole number"),
+    ],
+)
+def test_a_wrong_word_is_answered_by_a_sentence(arguments, answer, capsys):
+    assert main(arguments) == 2
+    assert answer in capsys.readouterr().err
+
+
+def test_a_wrong_option_is_compared_with_those_of_its_command(capsys):
+    with pytest.raises(SystemExit):
+        main(["compress", "x", "--output", "y", "--secnds", "4"])
+    told = capsys.readouterr().err
+    assert "--seconds" in told and "lumigraph compress --help" in told and "lumigraph train" not in told
 
 
 def test_a_traceback_on_request(tmp_path, monkeypatch):

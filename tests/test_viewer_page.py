@@ -53,6 +53,7 @@ def visit(viewer, page, size=SIZE):
     page.goto(viewer.address.url)
     visitor = until(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
     visitor.controls._sharpest.value = SHARPEST
+    until(lambda: visitor._arrived)  # a client's first camera is three.js's own
     settle(visitor)
     return visitor
 

@@ -1,4 +1,5 @@
-"""Jobs: commands in processes of their own, one after another, each by a typed request.
+"""Jobs: commands in processes of their own, each by a typed request. Scenes are made one after another, and files to
+share beside them, also one after another.
 
 A record is written before its process changes. After a kill of the app its child gets SIGTERM, saves and ends; the next
 app finds the job as running and starts the same command again, which continues from its stages or checkpoints.
@@ -20,6 +21,7 @@ from ..errors import LumigraphError
 from ..files import open_anew, refuse_links
 from ..system.children import REQUESTED, Request
 from ..viewer.address import HOST, Address, free_port, new_token
+from . import pace
 from .job_record import JobRecord, JobState, Making, ShareJob, change, change_making, change_share, read_job
 from .pictures import input_of
 from .projects import JOB_FILE, LOG_FILE, PHOTOS, RUNS, SCENE, SHARED, Item, is_plain_name, items
@@ -29,6 +31,8 @@ POLL_SECONDS = 0.2  # between looks at a child
 IDLE_SECONDS = 2.0  # between looks for jobs that nobody announced
 PATIENCE_SECONDS = 60.0  # for the child of an app that was killed to save
 LOG_BYTES = 60_000  # of the end of a log that are read
+MAKE, SHARE = "make", "share"  # lanes of jobs
+SHARE_NICENESS = 4  # of a file's command: beside a training it gets a quarter of the processors
 
 
 @dataclass
@@ -39,6 +43,10 @@ class QueuedJob:
     share: str | None
     child: subprocess.Popen[Any] | None = None
     viewer: Address | None = None  # of a training
+
+    @property
+    def lane(self) -> str:
+        return MAKE if self.share is None else SHARE
 
     @property
     def job(self) -> Making | ShareJob | None:
@@ -55,32 +63,46 @@ class QueuedJob:
 
 
 class Runner:
-    """Thread that runs the jobs of a folder, one after another, from `begin` until `end`.
+    """Threads that run the jobs of a folder from `begin` until `end`, one for each lane.
 
     program: words of Python before a request
+    running: the job at work in each lane
     """
 
     def __init__(self, root: Path, program: Sequence[str] = REQUESTED):
         self.root, self.program = root, list(program)
-        self.current: QueuedJob | None = None
-        self._wake, self._ended = threading.Event(), False
-        # A child ends with the thread that started it, so this one lives as long as the app.
-        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self.running: dict[str, QueuedJob] = {}
+        self._choosing, self._ended = threading.Lock(), False
+        # A child ends with the thread that started it, so these live as long as the app.
+        self._wake = {lane: threading.Event() for lane in (MAKE, SHARE)}
+        self._threads = [threading.Thread(target=self._work, args=(lane,), daemon=True) for lane in self._wake]
+
+    @property
+    def making(self) -> QueuedJob | None:
+        """The scene that is being made."""
+        return self.running.get(MAKE)
+
+    def works_in(self, item: Item) -> bool:
+        return any(task.item == item for task in list(self.running.values()))
 
     def begin(self) -> None:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def end(self) -> None:
-        """End the running command; its job continues when the app starts again."""
+        """End the running commands; their jobs continue when the app starts again."""
         self._ended = True
-        self._wake.set()
-        if (task := self.current) and task.child:
-            task.child.send_signal(signal.SIGTERM)
-        if self._thread.is_alive():
-            self._thread.join(PATIENCE_SECONDS)
+        self.wake()
+        for task in list(self.running.values()):
+            if task.child:
+                task.child.send_signal(signal.SIGTERM)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(PATIENCE_SECONDS)
 
     def wake(self) -> None:
-        self._wake.set()
+        for event in self._wake.values():
+            event.set()
 
     def queue(self) -> list[QueuedJob]:
         """Jobs that run or wait, in order."""
@@ -100,9 +122,15 @@ class Runner:
     def stop(self, task: QueuedJob, state: JobState) -> None:
         """Pause or stop a job; its command saves and ends. Returns immediately."""
         task.set(state=state)
-        running = self.current
+        running = self.running.get(task.lane)
         if running and running.child and (running.item, running.share) == (task.item, task.share):
             running.child.send_signal(signal.SIGINT)
+
+    def put_first(self, item: Item) -> None:
+        """Let a waiting scene be made now. The one at work saves, and goes on afterwards."""
+        change_making(item, asked=0.0)
+        if self.making and self.making.item != item:
+            self.stop(self.making, "queued")
 
     def extend(self, item: Item, **budget: Any) -> None:
         """Give a training another budget. Its command saves, ends, and is started again."""
@@ -115,20 +143,19 @@ class Runner:
             if task.item == item:
                 self.stop(task, "stopped")
         end = time.monotonic() + PATIENCE_SECONDS
-        while (running := self.current) and running.item == item:
+        while self.works_in(item):
             if time.monotonic() > end:
                 raise LumigraphError(f"A command still works in {item.path}; try again when it has ended")
             time.sleep(POLL_SECONDS)
 
-    def _work(self) -> None:
+    def _work(self, lane: str) -> None:
         self._await_orphans()
         while not self._ended:
-            task = next(iter(self.queue()), None)
+            task = self._next(lane)
             if task is None:
-                self._wake.wait(IDLE_SECONDS)
-                self._wake.clear()
+                self._wake[lane].wait(IDLE_SECONDS)
+                self._wake[lane].clear()
                 continue
-            self.current = task
             try:
                 self._run(task)
             except LumigraphError as fault:
@@ -136,7 +163,19 @@ class Runner:
             except Exception as fault:
                 self._fail(task, f"The job ended by a fault of the app ({type(fault).__name__}: {fault}); try it again")
             finally:
-                self.current = None
+                del self.running[lane]
+                self.wake()
+
+    def _next(self, lane: str) -> QueuedJob | None:
+        """The next job of a lane, which is at work from now on: one command at a time works in an item."""
+        with self._choosing:
+            busy = [task.item for task in self.running.values()]
+            for task in self.queue():
+                if task.lane == lane and task.item not in busy:
+                    self.running[lane] = task
+                    return task
+                busy.append(task.item)
+        return None
 
     def _fail(self, task: QueuedJob, fault: str) -> None:
         try:
@@ -158,6 +197,7 @@ class Runner:
         while not self._ended and (job := task.job) and job.state in ("queued", "running"):
             task.set(state="running", fault="")
             request, task.viewer = self._request(task)
+            begun, is_new = time.monotonic(), not (task.item.path / SCENE / "work").exists()
             code = self._call(task, request)
             job = task.job
             if self._ended or job is None or job.state != "running":
@@ -165,8 +205,12 @@ class Runner:
             if code:
                 self._fail(task, sentence(task.item, code))
             elif isinstance(job, Making) and job.stage == "capture":
+                if is_new:
+                    pace.note_capture(task.item, time.monotonic() - begun)
                 task.set(stage="train", process=0)
             else:
+                if isinstance(job, Making):
+                    pace.note_training(run_folder(task.item, job.run))
                 task.set(state="done", process=0)
 
     def _request(self, task: QueuedJob) -> tuple[Request, Address | None]:
@@ -191,6 +235,9 @@ class Runner:
             log.write(f"$ lumigraph {request.command}\n".encode())
             log.flush()
             task.child = request.start(self.program, stdout=log, stderr=subprocess.STDOUT)
+        if task.lane == SHARE and hasattr(os, "setpriority"):
+            with contextlib.suppress(ProcessLookupError):
+                os.setpriority(os.PRIO_PROCESS, task.child.pid, SHARE_NICENESS)
         task.set(process=task.child.pid)
         job = task.job
         if self._ended or job is None or job.state != "running":  # paused while it was being started

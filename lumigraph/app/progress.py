@@ -158,7 +158,10 @@ def capture_progress(item: Item) -> dict[str, Any]:
             said = f": {count} of {total}" if name == "features" and total else said
     else:
         stage = "Writing the scene"
-    return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2]}
+    made = sum(WEIGHTS[name] for name in STAGES if name in done and done[name].done)
+    spent = sum(done[name].seconds or 0.0 for name in STAGES if name in done and done[name].done)
+    left = spent / made * (1 - min(share, 1.0)) if made else None
+    return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2], "left": left}
 
 
 def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:

@@ -104,7 +104,8 @@ class Item:
         if self.kind != "project":
             return [self.path] if self.kind == "run" else []
         folder = self.path / RUNS
-        found = [path for path in folder.iterdir() if is_run(path) or is_splats(path)] if folder.is_dir() else []
+        paths = filter(lambda path: is_plain_name(path.name), folder.iterdir() if folder.is_dir() else ())
+        found = [path for path in paths if is_run(path) or is_splats(path)]
         return sorted(found, key=lambda path: (changed_at(path), natural(path.name)))
 
     def run(self, name: str) -> Path:

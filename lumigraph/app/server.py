@@ -34,8 +34,8 @@ from ..files.ranges import Count, Downscale, Pixels
 from ..system.children import REQUESTED
 from ..viewer.address import Address
 from ..viewer.guard import ISOLATION_HEADERS, MAX_MESSAGE_BYTES, Guard
-from . import jobs, pictures, progress, projects, rows, sharing, uploads
-from .job_record import JobState, Mapper, ShareName, read_job
+from . import jobs, pace, pictures, progress, projects, rows, sharing, uploads
+from .job_record import JobState, Making, Mapper, ShareName, read_job
 from .jobs import Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
 from .scene_views import SceneView, SceneViews, answers, forward, forward_messages
@@ -227,7 +227,7 @@ class App:
         record, job = item.record, read_job(item)
         files = pictures.photographs_of(item)
         runs = [rows.run_row(path) for path in item.runs]
-        current = self.runner.current
+        making = self.runner.making
         faults = [pictures.listing_fault(item), *(run.get("fault", "") for run in runs)]
         result = None
         try:
@@ -248,12 +248,31 @@ class App:
             ],
             "runs": runs,
             "make": rows.making_row(item, job.make) if job.make else None,
-            "live": current is not None and current.item == item and current.viewer is not None,
+            "live": making is not None and making.item == item and making.viewer is not None,
             "shares": [rows.share_row(item, share) for share in reversed(job.shares)],
             "result": result,
             "faults": list(filter(None, faults)),
-            "queue": [task.item.key for task in self.runner.queue()],
+            "ahead": self.ahead(item),
         }
+
+    def ahead(self, item: Item) -> dict[str, Any] | None:
+        """What a scene waits for: title of the one that is made now, seconds until it ends if known, and how many wait
+        before it."""
+        making = self.runner.making
+        if making is None or making.item == item or not isinstance(job := making.job, Making):
+            return None
+        waiting = [task.item for task in self.runner.queue() if task.share is None and task.item != making.item]
+        left = progress.progress_of(making.item, job).get("left")
+        between = waiting.index(item) if item in waiting else 0
+        return {"title": making.item.record.title, "left": left, "between": between}
+
+    def estimates(self, item: Item) -> dict[str, Any]:
+        """Seconds that each quality would take of each method, from what earlier ones took on this machine."""
+        return pace.estimates(item)
+
+    def put_first(self, item: Item) -> dict[str, Any]:
+        self.runner.put_first(item)
+        return self.detail(item)
 
     def advice(self, item: Item) -> list[dict[str, Any]]:
         return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.photographs_of(item))]
@@ -263,7 +282,7 @@ class App:
         return {"key": projects.rename(item, body.title).key}
 
     def duplicate(self, item: Item) -> dict[str, Any]:
-        if (current := self.runner.current) and current.item == item:
+        if (making := self.runner.making) and making.item == item:
             raise LumigraphError("This scene is being made; pause it first, then duplicate it")
         return {"key": projects.duplicate(item).key}
 
@@ -335,8 +354,8 @@ class App:
 
     def view(self, item: Item, run: str) -> dict[str, Any]:
         """Address of the scene view of a run, and whether it answers."""
-        current = self.runner.current
-        if not run and current and current.item == item and current.share is None and (viewer := current.viewer):
+        making = self.runner.making
+        if not run and making and making.item == item and (viewer := making.viewer):
             return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(viewer)}
         path = item.run(run) if run else next(iter(reversed(item.runs)), None)
         if path is None:
@@ -347,9 +366,9 @@ class App:
 
     def viewer_of(self, key: str, run: str) -> tuple[Address | None, SceneView | None]:
         """Address of the viewer behind a scene's address, and its view; None if there is none."""
-        item, current = self.item(key), self.runner.current
+        item, making = self.item(key), self.runner.making
         if run == "live":
-            return (current.viewer if current and current.item == item else None), None
+            return (making.viewer if making and making.item == item else None), None
         view = self.views.views.get(item.run(run))
         return (view.address if view else None), view
 
@@ -367,7 +386,7 @@ def check_source(source: Path) -> None:
 
 
 class RequestHandlers:
-    """RequestHandlers of requests, for the routes of `build`."""
+    """Answers of an app to the requests of the routes of `build`."""
 
     def __init__(self, app: App):
         self.app = app
@@ -436,7 +455,8 @@ class RequestHandlers:
         if not projects.is_plain_name(name) or place.is_symlink() or not place.is_file():
             raise LumigraphError(f"There is no file {name[:80]!r} here; make it again")
         shows = "inline" if "show" in request.query_params else "attachment"
-        return FileResponse(place, filename=name, content_disposition_type=shows, headers=SHOWN_HEADERS)
+        title = item.record.title.translate(NO_FILE_NAME).strip(". ") or place.stem
+        return FileResponse(place, filename=title + place.suffix, content_disposition_type=shows, headers=SHOWN_HEADERS)
 
     async def forget(self, request: Request) -> Response:
         item = await asyncio.to_thread(self.app.item, request.path_params["key"])
@@ -492,6 +512,8 @@ def build(app: App) -> ASGIApp:
         Route(f"{item}/pause", here.asked(None, lambda one: app.stop(one, "paused")), methods=["POST"]),
         Route(f"{item}/stop", here.asked(None, lambda one: app.stop(one, "stopped")), methods=["POST"]),
         Route(f"{item}/more", here.asked(MoreBody, app.more), methods=["POST"]),
+        Route(f"{item}/first", here.asked(None, app.put_first), methods=["POST"]),
+        Route(f"{item}/estimates", here.asked(None, app.estimates)),
         Route(f"{item}/view", here.asked(RunBody, lambda one, body: app.view(one, body.run)), methods=["POST"]),
         Route(f"{item}/kinds", here.asked(RunBody, app.kinds), methods=["POST"]),
         Route(f"{item}/shares", here.asked(ShareBody, app.share), methods=["POST"]),
@@ -507,6 +529,7 @@ def build(app: App) -> ASGIApp:
     return Gate(inner, app.address)
 
 
+NO_FILE_NAME = str.maketrans(dict.fromkeys('<>:"/\\|?*', "-"))  # letters that no system takes in a name
 # A page that was made to share runs its program apart from the app's own address.
 SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
 SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}

@@ -10,8 +10,10 @@ LUMIGRAPH_DEBUG=1 shows the traceback of a fault.
 import contextlib
 import functools
 import importlib
+import io
 import operator
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +29,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
+from ..files.names import meant
 from ..files.options import option_name
 from ..files.ranges import coherent, domain, format_value, groups_of, is_surprising, members, outside
 from ..system.signals import exit_code, listening, number_of
@@ -206,11 +209,31 @@ def parse(arguments: list[str]) -> Any:
         hidden = hidden_options(config) if {"--help", "-h"} & {*rest} and HELP_ALL not in rest else frozenset()
     if first == "train" and rest[:1] == ["captions"]:  # a model and no method
         commands[first] = importlib.import_module(".train_captions", __package__).TrainCaptions
-    kinds = []
-    for name, kind in commands.items():
-        first_sentence = (kind.__doc__ or "").strip().partition("\n")[0]
-        about = tyro.conf.subcommand(name, description=None if name == first else first_sentence)
-        kinds.append(Annotated[kind, about])
+    if first in commands:  # alone: a wrong word is compared with its own options
+        return check_command(understood(commands[first], f"lumigraph {first}", rest))
+    if first and not first.startswith("-"):
+        near = meant(first, NAMES)
+        hint = f"did you mean {near}?" if near else "`lumigraph --help` lists the commands"
+        raise LumigraphError(f"There is no command {first!r}; {hint}")
+    summaries = ((name, (kind.__doc__ or "").strip().partition("\n")[0]) for name, kind in commands.items())
+    kinds = [Annotated[commands[name], tyro.conf.subcommand(name, description=x)] for name, x in summaries]
     union: Any = functools.reduce(operator.or_, kinds)
-    arguments = ["--help" if x == HELP_ALL else x for x in arguments or ["--help"]]
-    return check_command(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))
+    return tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"], registry=RULES)
+
+
+def understood(kind: type, program: str, words: Sequence[str]) -> Any:
+    """The words as a command of a kind. Raises LumigraphError for a word in place of a number; leaves with code 2, and
+    tyro's explanation, for other ones that cannot be understood."""
+    words = ["--help" if x == HELP_ALL else x for x in words]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(kind, prog=program, args=words, registry=RULES)
+    except SystemExit:
+        flat = " ".join(re.sub("[│╭╮╰╯─]", " ", said.getvalue()).split())
+        if found := re.search(r"Error parsing (\S+): .*? from \[(.*?)\]", flat):
+            wanted = "a whole number" if "invalid literal for int" in flat else "a number"
+            wanted = wanted if "could not convert" in flat or "invalid literal" in flat else "what --help says of it"
+            raise LumigraphError(f"{found[1]} cannot be {found[2]}; give it {wanted}") from None
+        sys.stderr.write(said.getvalue())
+        raise

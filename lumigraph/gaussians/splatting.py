@@ -50,11 +50,9 @@ class Splatted:
     @cached_property
     def depth(self) -> Float[Tensor, "height width"]:
         """Opacity-weighted sum of depths along the optical axis; a second pass where `number` is of something else."""
-        return (
-            self.number
-            if self.of_depth
-            else self.composited(self.rgb.new_zeros(len(self.depths), 3), self.depths, self.stop)[1]
-        )
+        if self.of_depth:
+            return self.number
+        return self.composited(self.rgb.new_zeros(len(self.depths), 3), self.depths, self.stop)[1]
 
     def composited(
         self, vectors: Float[Tensor, "gaussian 3"], numbers: Float[Tensor, " gaussian"], stop: float

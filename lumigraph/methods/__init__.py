@@ -165,9 +165,9 @@ def check(name: str) -> str:
     """The name of an installed method, of itself or of a word in ALIASES; LumigraphError naming those there are."""
     name = ALIASES.get(name, name).replace("_", "-")
     if name not in available():
-        near = meant(name, available())
-        hint = f"; did you mean {near}?" if near else ""
-        raise LumigraphError(f"No method {name!r} is installed; there are: {', '.join(available()) or 'none'}{hint}")
+        near = meant(name, sorted(available(), key="gaussian-splatting".__ne__))  # the first of several
+        hint = f"did you mean {near}? There are" if near else "there are"
+        raise LumigraphError(f"No method {name!r} is installed; {hint}: {', '.join(available()) or 'none'}")
     return name
 
 

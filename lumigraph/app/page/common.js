@@ -54,6 +54,15 @@ export function lasting(seconds) {
   return `${(seconds / 3600).toFixed(1)} h`;
 }
 
+// "about 4 min": rounded as far as it is known.
+export const nearly = (seconds) => `about ${lasting(seconds < 60 ? 10 * Math.max(1, Math.round(seconds / 10)) : seconds < 5400 ? 60 * Math.max(1, Math.round(seconds / 60)) : seconds)}`;
+
+// A picture's score in words. PSNR of training photographs is a few dB higher than of held-out ones.
+export function judged(psnr, heldOut) {
+  const score = heldOut ? psnr + 2 : psnr;
+  return score >= 29 ? "Sharp" : score >= 24 ? "A bit soft" : "Rough";
+}
+
 export const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 
 // A request that repeats while the page is visible. Returns a function that ends it.

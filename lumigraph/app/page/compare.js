@@ -14,7 +14,7 @@ export function Compare({ detail, run, act }) {
     ${busy ? html`<span class="spinner small" aria-hidden="true"></span> ${job.state === "queued" ? "Waiting" : "Rendering"}`
       : views.length ? "Compare anew" : "Compare with photographs"}</button>`;
   const fault = job?.state === "failed" && html`<p class="fault" role="alert">${job.fault}</p>`;
-  if (!views.length) return html`<div class="wait">${make}${fault || html`<p>Renders up to twelve photographs' views. It waits until the training is done.</p>`}</div>`;
+  if (!views.length) return html`<div class="wait">${make}${fault || html`<p>Renders the views of up to twelve photographs, to lay them over each other.${detail.live ? " It begins when the training is done." : ""}</p>`}</div>`;
   const view = views.find((one) => one.name === chosen) || views[0];
   const source = (query) => pictureUrl(detail.key, { name: view.name, side: 1400, v: view.version, ...query });
   return html`<div class="compare">

@@ -1,7 +1,7 @@
 // Home: cards of all scenes and runs of the folder, and the place to drop photographs.
 
 import { html, useEffect, useRef, useState } from "./preact.js";
-import { ago, api, bytes, of, phone, pictureUrl, repeat } from "./common.js";
+import { ago, api, bytes, judged, of, phone, pictureUrl, repeat } from "./common.js";
 
 export function Home({ say, choose, go }) {
   const [home, setHome] = useState(null);
@@ -106,8 +106,8 @@ function Card({ card, act, say, load, queue }) {
   const [title, setTitle] = useState(null);
   const share = card.share ? ` · ${Math.round(100 * card.share)} %` : "";
   const state = STATES[card.state] ? STATES[card.state] + share : "";
-  const score = card.psnr ? `${card.psnr.toFixed(1)} dB` : "";
-  const facts = [card.method, score, card.bytes !== null && bytes(card.bytes), ago(card.age)].filter(Boolean);
+  const score = card.psnr && !state ? judged(card.psnr, card.held_out) : "";
+  const facts = [score, card.bytes !== null && bytes(card.bytes), ago(card.age)].filter(Boolean);
   const rename = (event) => {
     event.preventDefault();
     act(() => api("PATCH", of(card.key), { title }));
@@ -142,6 +142,6 @@ function Card({ card, act, say, load, queue }) {
         </div>
       </details>
     </div>
-    <p class="faint" title=${card.held_out === false ? "PSNR of training photographs" : "PSNR of held-out photographs"}>${card.fault && !state ? card.fault : facts.join(" · ")}</p>
+    <p class="faint" title=${card.psnr ? `${card.method}, ${card.psnr.toFixed(1)} dB on ${card.held_out ? "held-out" : "training"} photographs` : ""}>${card.fault && !state ? card.fault : facts.join(" · ")}</p>
   </li>`;
 }

@@ -1,12 +1,12 @@
 // Making a scene: quality, progress, pause and stop, failures with their remedies, findings of the capture.
 
-import { html, useState } from "./preact.js";
-import { api, counted, lasting, of } from "./common.js";
+import { html, useEffect, useState } from "./preact.js";
+import { api, counted, judged, lasting, nearly, of } from "./common.js";
 
 const QUALITIES = [
   ["draft", "Draft", "to check the photographs"],
   ["good", "Good", "most of the possible sharpness"],
-  ["best", "Best", "as sharp as it gets, hours without a GPU"],
+  ["best", "Best", "as sharp as it gets"],
 ];
 const METHODS = [
   ["gaussian-splatting", "Gaussian splatting: quick, for pages and films"],
@@ -27,6 +27,15 @@ export function Making({ detail, act, uploading, show }) {
     ${!trained && html`<${Choose} detail=${detail} act=${act} uploading=${uploading} show=${show} first=${true} />`}`;
 }
 
+// Seconds by method and quality, on this computer.
+function useEstimates(detail, uploading) {
+  const [found, setFound] = useState({});
+  useEffect(() => {
+    if (detail.photographs.length && !uploading) api("GET", `${of(detail.key)}/estimates`).then(setFound, () => {});
+  }, [detail.key, detail.photographs.length, uploading]);
+  return found;
+}
+
 function Choose({ detail, act, uploading, show, first }) {
   const [quality, setQuality] = useState("draft");
   const [method, setMethod] = useState("gaussian-splatting");
@@ -37,6 +46,7 @@ function Choose({ detail, act, uploading, show, first }) {
   const [known, setKnown] = useState(METHODS);
   const video = detail.photographs.some((one) => one.video);
   const ready = detail.photographs.length > 0 && !uploading;
+  const times = useEstimates(detail, uploading)[method] || {};
   const start = async () => {
     const body = { quality, method, mapper, mask_object: masked };
     if (minutes) body.minutes = Number(minutes);
@@ -49,7 +59,7 @@ function Choose({ detail, act, uploading, show, first }) {
     <div class="choices" role="radiogroup" aria-label="Quality">
       ${QUALITIES.map(([name, title, about]) => html`<label class=${quality === name ? "choice on" : "choice"}>
         <input type="radio" name="quality" value=${name} checked=${quality === name} onChange=${() => setQuality(name)} />
-        <strong>${title}</strong><span class="faint">${about}</span></label>`)}
+        <strong>${title}${times[name] && !minutes ? html` <span class="faint">${nearly(times[name])}</span>` : ""}</strong><span class="faint">${about}</span></label>`)}
     </div>
     <details class="advanced"><summary>Advanced</summary>
       <label>Method<select value=${method} onChange=${(event) => setMethod(event.target.value)}>
@@ -67,10 +77,11 @@ function Choose({ detail, act, uploading, show, first }) {
 function Progress({ detail, act, show }) {
   const { make } = detail;
   if (make.state === "queued") {
-    const ahead = detail.queue.indexOf(detail.key);
+    const { ahead } = detail;
     return html`<section class="panel" aria-label="Progress"><h2>Waiting</h2>
-      <p class="faint" role="status">${ahead > 0 ? `${counted(ahead, "job")} before this one.` : "It begins in a moment."}</p>
-      <button onClick=${() => act(() => api("POST", `${of(detail.key)}/stop`))}>Stop</button></section>`;
+      <p class="faint" role="status">${ahead ? `“${ahead.title}” is being made${ahead.left ? `, ${nearly(ahead.left)} more` : ""}${ahead.between ? `, then ${counted(ahead.between, "other scene")}` : ""}.` : "It begins in a moment."}</p>
+      <div class="row">${ahead && html`<button class="main" onClick=${() => act(() => api("POST", `${of(detail.key)}/first`))}>Start now, pause that</button>`}
+      <button onClick=${() => act(() => api("POST", `${of(detail.key)}/stop`))}>Stop</button></div></section>`;
   }
   const { progress } = make;
   const training = make.stage === "train";
@@ -78,18 +89,19 @@ function Progress({ detail, act, show }) {
   const facts = training
     ? [progress.psnr && `${progress.psnr.toFixed(1)} dB`, progress.gaussians && `${Math.round(progress.gaussians).toLocaleString()} Gaussians`, progress.step && `step ${progress.step.toLocaleString()}`]
     : [progress.said];
-  const left = training && progress.left ? `about ${lasting(progress.left)} left` : "";
+  const left = progress.left ? `${nearly(progress.left)} left` : "";
   return html`<section class="panel" aria-label="Progress">
     <ol class="steps"><li class="done">Photographs</li><li class=${training ? "done" : "now"}>Cameras</li><li class=${training ? "now" : ""}>Training</li></ol>
     <div class="line"><h2 role="status">${progress.stage}</h2><span>${share} %</span></div>
     <progress max="100" value=${share} aria-label=${progress.stage}></progress>
-    <p class="faint">${[left, ...facts].filter(Boolean).join(" · ") || " "}</p>
-    ${training && progress.curve?.length > 2 && html`<${Curve} points=${progress.curve} />`}
+    <p class="faint">${left || " "}</p>
     <div class="row">
       <button onClick=${() => act(() => api("POST", `${of(detail.key)}/pause`))}>Pause</button>
       <button onClick=${() => act(() => api("POST", `${of(detail.key)}/stop`))}>${training ? "Stop here" : "Stop"}</button>
       ${training && make.next && html`<button onClick=${() => act(() => api("POST", `${of(detail.key)}/more`, { quality: make.next }))}>More time: ${make.next}</button>`}
     </div>
+    <details class="advanced"><summary>Details</summary><p class="faint">${facts.filter(Boolean).join(" · ")}</p>
+      ${training && progress.curve?.length > 2 && html`<${Curve} points=${progress.curve} />`}</details>
     <${Messages} lines=${make.messages} />
   </section>`;
 }
@@ -102,7 +114,7 @@ function Curve({ points }) {
   const at = ([x, y]) => `${((w * (x - x0)) / (x1 - x0 || 1)).toFixed(1)},${(h - 3 - ((h - 6) * (y - y0)) / (y1 - y0 || 1)).toFixed(1)}`;
   return html`<figure class="curve"><svg viewBox=${`0 0 ${w} ${h}`} preserveAspectRatio="none" role="img"
     aria-label=${`PSNR from ${y0.toFixed(1)} to ${y1.toFixed(1)} dB`}><polyline points=${points.map(at).join(" ")} vector-effect="non-scaling-stroke" /></svg>
-    <figcaption class="faint">PSNR of training photographs, ${y0.toFixed(1)} to ${y1.toFixed(1)} dB</figcaption></figure>`;
+    <figcaption class="faint">PSNR of training photographs, ${y0.toFixed(1)} to ${y1.toFixed(1)} dB; it falls where larger pictures begin</figcaption></figure>`;
 }
 
 function Paused({ detail, act }) {
@@ -138,14 +150,18 @@ function Continue({ detail, act }) {
   const next = make ? make.next : "good";
   if (make && ["running", "queued"].includes(make.state)) return html`<${Progress} detail=${detail} act=${act} />`;
   const stopped = make && ["stopped", "failed", "paused"].includes(make.state);
+  const times = useEstimates(detail, false)[last?.method] || {};
+  const score = last?.psnr ? judged(last.psnr, last.held_out) : "";
+  const help = score && score !== "Sharp" && !stopped && next ? `: ${times[next] ? `${nearly(times[next])} of training` : "more time"} may help` : "";
   return html`<section class="panel" aria-label="The scene"><h2>${stopped ? "Stopped" : "Ready"}</h2>
-    <p class="faint">${[last?.method, last?.psnr && `${last.psnr.toFixed(1)} dB${last.held_out ? " held out" : " on training photographs"}`, make?.quality].filter(Boolean).join(" · ")}</p>
+    ${score && html`<p>${score}${help}.</p>`}
     <div class="row">
       ${stopped && make.run && html`<button class="main" onClick=${() => more({})}>Go on</button>`}
       ${!stopped && next && html`<button onClick=${() => more({ quality: next })}>More time: ${next}</button>`}
       ${!stopped && make?.seconds && html`<button onClick=${() => more({ minutes: (3 * make.seconds) / 60 })}>More time: ${lasting(3 * make.seconds)}</button>`}
       ${detail.kind !== "run" && html`<button aria-expanded=${fresh} onClick=${() => setFresh(!fresh)}>Make it anew</button>`}
     </div>
+    <details class="advanced"><summary>Details</summary><p class="faint">${[last?.method, last?.psnr && `${last.psnr.toFixed(1)} dB${last.held_out ? " held out" : " on training photographs"}`, make?.quality].filter(Boolean).join(" · ")}</p></details>
     ${fresh && html`<${Choose} detail=${detail} act=${act} uploading=${false} show=${() => {}} />`}
   </section>`;
 }

@@ -11,7 +11,7 @@ export function Photographs({ detail, states, advice, choose, act, marked }) {
   const up = stateOf(detail.key);
   const sending = isUploading(detail.key);
   const own = detail.kind === "project" && !detail.source;
-  const warned = new Set(advice.flatMap((one) => one.names));
+  const warned = new Set((advice || []).flatMap((one) => one.names));
   const named = Object.keys(states).length > 0 && detail.photographs.some((one) => one.video)
     ? Object.keys(states).map((name) => ({ name, version: detail.result ? "made" : "now" }))
     : detail.photographs;
@@ -28,7 +28,11 @@ export function Photographs({ detail, states, advice, choose, act, marked }) {
       ${up.pause && html`<p class="fault">${up.pause}</p>`}</div>`}
     ${up.faults.length > 0 && html`<ul class="faults" role="alert">${up.faults.slice(0, 5).map((text) => html`<li>${text}</li>`)}
       ${up.faults.length > 5 && html`<li>and ${up.faults.length - 5} more</li>`}</ul>`}
-    ${advice.length > 0 && html`<ul class="advice" aria-label="Advice">${advice.map((one) => html`<li>${one.text}</li>`)}</ul>`}
+    ${!sending && detail.photographs.length > 0 && !detail.result && (advice === null
+      ? html`<p class="faint pad" role="status">Looking at the photographs …</p>`
+      : advice.length > 0
+        ? html`<ul class="advice" aria-label="Advice">${advice.map((one) => html`<li>${one.text}</li>`)}</ul>`
+        : html`<p class="faint pad" role="status">${detail.photographs.some((one) => one.video) ? "The video can be read." : "All photographs look good: sharp, bright, and with the same things in several of them."}</p>`)}
     <ul class="photographs" aria-label="Photographs">
       ${named.map((one) => html`<${Photograph} key=${one.name} item=${detail.key} one=${one} state=${stateFor(one.name)} warned=${warned.has(one.name)} marked=${marked}
         open=${() => setOpen(one)} />`)}

@@ -16,7 +16,8 @@ export function Project({ item, say, choose, go }) {
   const [fault, setFault] = useState("");
   const [states, setStates] = useState({});
   const [model, setModel] = useState(NO_MODEL);
-  const [advice, setAdvice] = useState([]);
+  const [advice, setAdvice] = useState(null); // of all photographs; null before they have been looked at
+  const [title, setTitle] = useState(null);
   const [tab, setTab] = useState(null);
   const [run, setRun] = useState("");
   const [, tick] = useState(0);
@@ -39,6 +40,7 @@ export function Project({ item, say, choose, go }) {
       if (latest.current.arrived !== arrived && found.kind !== "run") {
         latest.current.arrived = arrived;
         latest.current.stale = true;
+        setAdvice(null);
       }
       advise();
     } catch (error) {
@@ -46,10 +48,11 @@ export function Project({ item, say, choose, go }) {
     }
   };
   const advise = async () => {
-    if (!latest.current.stale || latest.current.asking) return; // one at a time: it takes longer than other requests
+    if (!latest.current.stale || latest.current.asking || isUploading(item)) return; // one at a time: it takes longer than other requests
     Object.assign(latest.current, { stale: false, asking: true });
-    await api("GET", `${of(item)}/advice`).then(setAdvice, () => {});
+    const found = await api("GET", `${of(item)}/advice`).catch(() => null);
     latest.current.asking = false;
+    if (!latest.current.stale) setAdvice(found);
   };
   useEffect(() => repeat(1, load), [item]);
   useEffect(() => {
@@ -74,6 +77,12 @@ export function Project({ item, say, choose, go }) {
     } finally {
       load();
     }
+  };
+
+  const rename = (event) => {
+    event.preventDefault();
+    setTitle(null);
+    api("PATCH", of(item), { title }).then(({ key }) => (key === item ? load() : go(key)), (error) => say(error.message));
   };
 
   if (!detail) {
@@ -103,7 +112,11 @@ export function Project({ item, say, choose, go }) {
   return html`
     <header class="top">
       <a class="back" href="#" aria-label="All scenes">‹ <span>All scenes</span></a>
-      <h1 title=${detail.folder}>${detail.title}</h1>
+      ${title === null
+        ? html`<h1 title=${detail.folder}>${detail.title}</h1>
+          ${detail.kind !== "scene" && html`<button class="plain" aria-label="Rename" onClick=${() => setTitle(detail.title)}>✎</button>`}`
+        : html`<form class="row tight" onSubmit=${rename}><input aria-label="New name" maxlength="120" value=${title} ref=${(field) => field && field !== document.activeElement && field.focus()}
+            onInput=${(event) => setTitle(event.target.value)} onKeyDown=${(event) => event.key === "Escape" && setTitle(null)} /><button class="main">Rename</button></form>`}
     </header>
     ${fault && html`<p class="fault" role="alert">${fault}</p>`}
     ${detail.faults.map((text) => html`<p class="fault">${text}</p>`)}

@@ -106,25 +106,15 @@ class AdaptiveDensity(DensityControl):
     def refine(self, cloud: GrowingCloud, extent: float, cap: int, generator: torch.Generator) -> bool:
         """Clone, split and prune. Returns whether the cap prevented some clones or splits."""
         gradient = self.positional_gradient_sum / self.visible_count.clamp_min(1)
-        wanted = (gradient > self.numbers.densify_grad_threshold).nonzero()[:, 0]
-        faint = cloud.opacities.sigmoid() < PRUNE_OPACITY
-        wanted = wanted[~faint[wanted]]
-        room = max(cap - int((~faint).sum()), 0)
-        full = len(wanted) > room
-        if full:  # the largest gradients first
-            wanted = wanted[gradient[wanted].argsort(descending=True)[:room]].sort().values
-        large = cloud.log_scales[wanted].exp().amax(-1) > MAX_CLONED_SCALE * extent
-        kept = (~faint).nonzero()[:, 0]
-        source = torch.cat([kept, wanted])
-        fresh = torch.arange(len(source), device=source.device) >= len(kept)
-        halves = torch.zeros(len(cloud), dtype=torch.bool, device=source.device)
-        halves[wanted[large]] = True
-        split = halves[source]  # the original of a split is the other half
-        cloud.rebuild(source, fresh | split)
+        kept = (~(cloud.opacities.sigmoid() < PRUNE_OPACITY)).nonzero()[:, 0]
+        wanted = kept[gradient[kept] > self.numbers.densify_grad_threshold]
+        chosen = largest(wanted, gradient, cap - len(kept))
+        large = cloud.log_scales[chosen].exp().amax(-1) > MAX_CLONED_SCALE * extent
+        split, _ = add_copies(cloud, kept, chosen, chosen[large])
         scatter(cloud, split, generator)
         for name in self.grows:
             getattr(self, name).zero_()
-        return full
+        return len(chosen) < len(wanted)
 
     @torch.no_grad()
     def reset_opacity(self, cloud: Cloud) -> None:
@@ -135,6 +125,26 @@ class AdaptiveDensity(DensityControl):
         for moment in ("mean", "square"):
             state[moment].zero_()
         state["last"].fill_(float(state["step"]))
+
+
+def largest(rows: Int[Tensor, " candidate"], score: Float[Tensor, " gaussian"], room: int) -> Int[Tensor, " chosen"]:
+    """The rows, or the `room` of them with the largest score, in their order."""
+    return rows if len(rows) <= room else rows[score[rows].argsort(descending=True)[: max(room, 0)]].sort().values
+
+
+@torch.no_grad()
+def add_copies(
+    cloud: GrowingCloud, kept: Int[Tensor, " kept"], copied: Int[Tensor, " copied"], divided: Int[Tensor, " divided"]
+) -> tuple[Bool[Tensor, " new"], Bool[Tensor, " new"]]:
+    """Rebuild a cloud of the rows that are kept, and copies behind them. Returns masks of both halves of divided rows,
+    whose moments are zero, and of the copies."""
+    source = torch.cat([kept, copied])
+    fresh = torch.arange(len(source), device=source.device) >= len(kept)
+    halved = torch.zeros(len(cloud), dtype=torch.bool, device=source.device)
+    halved[divided] = True
+    halves = halved[source]  # the original is the other half
+    cloud.rebuild(source, fresh | halves)
+    return halves, fresh
 
 
 @torch.no_grad()

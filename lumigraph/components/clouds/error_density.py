@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...geometry import to_matrix
-from .adaptive import AdaptiveDensity
+from .adaptive import AdaptiveDensity, add_copies, largest
 from .addition import Step
 from .cloud import GrowingCloud
 from .density_control import PRUNE_OPACITY
@@ -43,19 +43,11 @@ class ErrorDensity(AdaptiveDensity):
         """Prune and divide. Returns whether the cap prevented some divisions."""
         kept = (cloud.opacities.sigmoid() >= PRUNE_OPACITY).nonzero()[:, 0]
         wanted = kept[self.explained[kept] > 0]
-        room = max(cap - len(kept), 0)
-        full = len(wanted) > room
-        if full:  # the largest errors first
-            wanted = wanted[self.explained[wanted].topk(room).indices].sort().values
-        source = torch.cat([kept, wanted])
-        fresh = torch.arange(len(source), device=source.device) >= len(kept)
-        divided = torch.zeros(len(cloud), dtype=torch.bool, device=source.device)
-        divided[wanted] = True
-        halves = divided[source]  # the original is the other half
-        cloud.rebuild(source, fresh | halves)
+        chosen = largest(wanted, self.explained, cap - len(kept))
+        halves, fresh = add_copies(cloud, kept, chosen, chosen)
         divide(cloud, halves, torch.where(fresh, -1.0, 1.0)[halves])
         self.explained.zero_()
-        return full
+        return len(chosen) < len(wanted)
 
 
 def pixel_errors(step: Step) -> Float[Tensor, "height width"]:

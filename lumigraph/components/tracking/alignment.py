@@ -96,8 +96,9 @@ def level_step(metres: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
     """Distance of each depth from the next level, where depth has few levels, as of eight bits; else 0."""
     known = metres[metres.isfinite()]
     levels, counts = (1e4 * known).round().unique(return_counts=True)
-    levels = levels[counts >= LEVEL_SHARE * len(known)] / 1e4
-    if len(levels) < 3 or int(counts[counts >= LEVEL_SHARE * len(known)].sum()) < 0.5 * len(known):
+    often = counts >= LEVEL_SHARE * len(known)
+    levels = levels[often] / 1e4
+    if len(levels) < 3 or int(counts[often].sum()) < 0.5 * len(known):
         return torch.zeros_like(metres)
     gaps, place = levels.diff(), torch.searchsorted(levels, metres.nan_to_num(0.0))
     return torch.minimum(gaps[(place - 1).clamp(0, len(gaps) - 1)], gaps[place.clamp(0, len(gaps) - 1)])

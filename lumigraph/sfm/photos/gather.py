@@ -187,7 +187,9 @@ def walk(
     """
     with explained(folder):
         entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
-    seen = {folder.resolve()} if entries and seen is None else seen or set()
+    if not entries:
+        return
+    seen = {folder.resolve()} if seen is None else seen
     folders = {entry.name for entry in entries if os.path.isdir(entry)}
     masks = {name for entry in entries for name in names_beside(entry.stem)}
     for entry in entries:
