@@ -179,6 +179,7 @@ def own_tests(checkout: Path, seconds: float) -> list[Row]:
         around = os.environ | {
             "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "benchmarks" / "foreign"), folder]),
             "LUMIGRAPH_OUTCOMES": str(outcomes),
+            "OMP_NUM_THREADS": "1",  # tensors are small
         }
         files = [f"tests/test_{name}.py" for name in FILES]
         words = ["-m", "pytest", "-p", "gsplat_adapted", "--noconftest", "-q", "--tb=no", "-k", WITHOUT, *files]
