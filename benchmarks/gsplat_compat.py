@@ -59,11 +59,12 @@ WAYS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # a value of a param
     "covars": ({"covars": True}, {}),
     "include_last": ({"include_last": True}, {"exclusive": False}),
     "render_mode": ({}, {}),
+    "renderer_config": ({"renderer_config": 1}, {}),
 }  # fmt: skip
 REFUSED: dict[str, Any] = {
     "distributed": True, "with_eval3d": True, "return_normals": True, "rays": torch.zeros(1),
     "ftheta_coeffs": 1, "lidar_coeffs": 1, "external_distortion_coeffs": 1, "rolling_shutter": 1,
-    "viewmats_rs": torch.eye(4), "renderer_config": 1,
+    "viewmats_rs": torch.eye(4),
 }  # fmt: skip
 # Parameters that tests/test_rasterization.py compares in another way than WAYS.
 ELSEWHERE = {

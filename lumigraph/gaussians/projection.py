@@ -41,6 +41,10 @@ class UnscentedTransformParameters:
     in_image_margin_factor: float = 0.1
     require_all_sigma_points_valid: bool = False
 
+    def __post_init__(self) -> None:
+        if self.alpha**2 * (3 + self.kappa) <= 0:
+            raise LumigraphError(f"alpha^2 (3 + kappa) must be positive, and alpha={self.alpha}, kappa={self.kappa}")
+
 
 @dataclass(frozen=True)
 class Distortion:
@@ -126,6 +130,9 @@ def pixels_of(
 ) -> tuple[Float[Tensor, "*point 2"], Bool[Tensor, "*point"]]:
     """Pixels of points in the camera's frame, and whether each is in front, in the picture with its margin (a share of
     the size), and where the distortion does not fold."""
+    allowed = {"pinhole": ("radial", "tangential", "thin_prism"), "fisheye": ("radial",)}.get(model, ())
+    if named := [name for name, value in vars(lens).items() if value is not None and name not in allowed]:
+        raise LumigraphError(f"camera_model={model!r} has no {', '.join(named)} coefficients; leave them out")
     z = points[..., 2]
     front = z > 0
     flat = points[..., :2] if model == "ortho" else points[..., :2] / torch.where(front, z, 1.0)[..., None]

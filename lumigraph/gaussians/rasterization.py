@@ -19,7 +19,7 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..color.blending import over
 from ..errors import LumigraphError
-from ..geometry import multiply, to_matrix, to_quaternion
+from ..geometry import to_matrix
 from ..system.work import at_work
 from .projection import (
     MIN_COMPENSATION,
@@ -114,7 +114,7 @@ class CloudViews:
             lead = dims + (cameras if name in ("viewmats", "Ks", *lenses) else means.shape[-2:-1])
             if x is not None and (x.ndim != len(dims) + axes or x.shape[: len(lead)] != lead):
                 raise LumigraphError(f"{name} has the shape {tuple(x.shape)}, not {tuple(lead)} and its own axes")
-            flat[name] = None if x is None else x.float().reshape(-1, *x.shape[len(dims) :])
+            flat[name] = None if x is None else x.float().reshape(prod(dims), *x.shape[len(dims) :])
         return cls(tuple(dims), **{name: flat[name] for name in tensors}, lenses={name: flat[name] for name in lenses})
 
     @property
@@ -134,7 +134,8 @@ class CloudViews:
         b, c = self.place(image)
         means, quats, scales, covars, opacities = self.cloud(b)
         viewmat, K = self.viewmats[b, c], self.Ks[b, c]
-        if how.model == "pinhole" and how.transform is None and covars is None and K[0, 1] == 0:
+        plain = how.model == "pinhole" and how.transform is None and covars is None and K[0, 1] == 0
+        if plain and not viewmat.requires_grad:  # the kernel has no gradient in poses
             assert quats is not None and scales is not None and opacities is not None
             return by_kernel(means, quats, scales, opacities, viewmat, K, how)
         return by_definition(means, quats, scales, covars, opacities, viewmat, K, how, self.lens(image))
@@ -220,7 +221,7 @@ def rasterization(
     global_z_order: False sorts by distance and renders it as depth, with_ut
     extra_signals: further channels, rendered to `info["render_extra_signals"]`
     include_last: keep the Gaussian that ends a ray (Kerbl 2023); gsplat leaves it out
-    sparse_grad, tile_size, channel_chunk, segmented: accepted, and without effect on pictures; gradients are dense
+    sparse_grad, tile_size, channel_chunk, segmented, renderer_config: without effect on pictures; gradients are dense
 
     Returns pictures, opacities, and a dictionary: "means2d", which may retain its gradient, "radii" in whole pixels,
     "depths", "conics", "opacities", "width", "height", "n_cameras" and what strategies of gsplat read. Packed, it has
@@ -232,8 +233,8 @@ def rasterization(
     wants.check(colors, lenses, with_ut, rasterize_mode, {
         "distributed": distributed, "with_eval3d": with_eval3d, "return_normals": return_normals, "rays": rays,
         "ftheta_coeffs": ftheta_coeffs, "lidar_coeffs": lidar_coeffs, "viewmats_rs": viewmats_rs,
-        "external_distortion_coeffs": external_distortion_coeffs, "rolling_shutter": rolling_shutter,
-        "renderer_config": renderer_config, "sparse_grad without packed": sparse_grad and not packed,
+        "external_distortion_coeffs": external_distortion_coeffs,
+        "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) not in (None, "GLOBAL"), "sparse_grad without packed": sparse_grad and not packed,
         "global_z_order=False without with_ut": not global_z_order and not with_ut,
         "covars with with_ut": covars is not None and with_ut})  # fmt: skip
     check_model(camera_model)
@@ -348,11 +349,9 @@ def by_kernel(
     how: Projecting,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Centres, conics, depths, opacities and radii of Gaussians in a pinhole camera, by the kernel."""
-    poses = viewmat.requires_grad
-    seen = in_camera(means, quats, viewmat) if poses else (means, quats)
-    camera = camera_of(torch.eye(4).to(viewmat) if poses else viewmat, K, *how.size)
+    camera = camera_of(viewmat, K, *how.size)
     view, unused = view_of(camera, how.near).to(means.device), means.new_zeros(len(means), 1, 3)
-    centres, conics, depths, _, alphas = kernels.project(*seen, scales, opacities, unused, view, 1, how.blur)
+    centres, conics, depths, _, alphas = kernels.project(means, quats, scales, opacities, unused, view, 1, how.blur)
     if how.compensate:
         alphas = alphas * compensation_of(conics, how.blur)
     radii = radii_of(conics.detach(), alphas.detach())
@@ -467,22 +466,6 @@ def matrices_of(
     viewmats[:, :3, 3:] = -rotation @ cameras.pose[:, :, 3:]
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = lens.focal, lens.centre
     return viewmats, Ks
-
-
-def in_camera(
-    means: Float[Tensor, "gaussian 3"], quats: Float[Tensor, "gaussian 4"], viewmat: Float[Tensor, "4 4"]
-) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"]]:
-    """Means and rotations in a camera's frame, differentiable in its pose, which is a constant for the kernels.
-
-    The camera's rotation is exp(w) R with w = 0, acting on quaternions to first order, so gradients in viewmats are
-    those of rotations.
-    """
-    rotation = viewmat[:3, :3]
-    change = rotation @ rotation.detach().T
-    axis = 0.5 * torch.stack([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
-    small = torch.cat([torch.ones_like(axis[:1]), axis / 2])
-    turn = multiply(small[None], to_quaternion(rotation.detach()).to(quats)[None])
-    return means @ rotation.T + viewmat[:3, 3], multiply(turn, quats)
 
 
 def composited(

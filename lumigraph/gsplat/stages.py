@@ -128,7 +128,7 @@ def fully_fused_projection_with_ut(
 ) -> tuple[Any, ...]:
     """The same by the unscented transform, with distortion; differentiable, where gsplat's is not."""
     check_model(camera_model)
-    if named := [name for name, value in refused.items() if value is not None]:
+    if named := [name for name, value in refused.items() if getattr(value, "name", value) not in (None, "GLOBAL")]:
         raise LumigraphError(f"fully_fused_projection_with_ut() has no {', '.join(named)}; leave it out")
     given = {"means": means, "quats": quats, "scales": scales, "covars": None, "opacities": opacities,
              "viewmats": viewmats, "Ks": Ks}  # fmt: skip
