@@ -234,7 +234,8 @@ def rasterization(
         "distributed": distributed, "with_eval3d": with_eval3d, "return_normals": return_normals, "rays": rays,
         "ftheta_coeffs": ftheta_coeffs, "lidar_coeffs": lidar_coeffs, "viewmats_rs": viewmats_rs,
         "external_distortion_coeffs": external_distortion_coeffs,
-        "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) not in (None, "GLOBAL"), "sparse_grad without packed": sparse_grad and not packed,
+        "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) not in (None, "GLOBAL"),
+        "sparse_grad without packed": sparse_grad and not packed,
         "global_z_order=False without with_ut": not global_z_order and not with_ut,
         "covars with with_ut": covars is not None and with_ut})  # fmt: skip
     check_model(camera_model)
