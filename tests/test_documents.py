@@ -27,7 +27,7 @@ from lumigraph.light.probes import write_probes
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.run import build
 
-pytestmark = budget("runs", 12)
+pytestmark = budget("runs", 24)
 
 ROOT = PACKAGE.parent
 SECONDS = {"seconds=30.0": "steps=2"}  # of the block of docs/convert.md
