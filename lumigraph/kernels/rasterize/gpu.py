@@ -131,7 +131,7 @@ def _backward(
         g_w = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
         g_w += v[3][:, None] * g[3][None, :] + g[4][None, :]
         gw_behind = rest[None, :] - tl.cumsum(w * g_w, 0)
-        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (not ended)
+        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (ended == 0)
         d_power = tl.where(moves, raw * (T * g_w - gw_behind / (1 - alpha)), 0.0)
         _add(d_colours, 3 * n, tl.sum(w * g[0][None, :], 1), here)
         _add(d_colours, 3 * n + 1, tl.sum(w * g[1][None, :], 1), here)
