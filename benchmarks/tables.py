@@ -8,8 +8,8 @@ OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMI
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
 choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
-`table: reading` of `reading.py --publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and
-the commands of those rows.
+`table: reading` of `reading.py --publish`, and `parameters`, `owntests` and `trainings` of `gsplat_compat.py --publish`;
+`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
 GALLERY, STRANGERS = RESULTS.with_name("gallery-cpu.json"), RESULTS.with_name("strangers-cpu.json")
 MINUTE, READING = RESULTS.with_name("one-minute-cpu.json"), RESULTS.with_name("reading-cpu.json")
+SPLATS = RESULTS.with_name("gsplat-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 GUIDES = {  # pages about sections of the gallery, in docs/
@@ -71,7 +72,11 @@ def read() -> dict[str, Any]:
     """Results of `lumigraph bench methods`, and of other programs as parts of them."""
     results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
     others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE, "reading": READING}
-    return results | {name: json.loads(path.read_text("utf-8")) for name, path in others.items()}
+    splats = json.loads(SPLATS.read_text("utf-8"))
+    parts = {
+        name: splats | {"cells": splats[name], "commands": splats["commands"][name]} for name in splats["commands"]
+    }
+    return results | {name: json.loads(path.read_text("utf-8")) for name, path in others.items()} | parts
 
 
 def pages() -> list[Path]:
@@ -242,6 +247,34 @@ def by_program(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(list(zip(*columns, strict=True)))
 
 
+def by_parameter(cells: Sequence[Row], page: Path) -> list[str]:
+    """Parameters of `rasterization`, with errors or the check."""
+    rows = [["parameter", "default", "accepted", "error of pictures", "of gradients"]]
+    for row in cells:
+        errors = [f"{row['value']:.0e}", f"{row['gradient']:.0e}"] if "value" in row else [row.get("check", ""), ""]
+        default = f"`{row['default']}`" if row["default"] else ""
+        rows.append([f"`{row['parameter']}`", default, row["accepted"], *errors])
+    return markdown(rows)
+
+
+def by_test(cells: Sequence[Row], page: Path) -> list[str]:
+    """Outcomes of gsplat's tests by file, without those of its CUDA operators."""
+    rows = [["file", "passed", "failed", "refused"]]
+    for file in dict.fromkeys(row["test"].split()[0] for row in cells):
+        own = [row for row in cells if row["test"].split()[0] == file]
+        rows.append([f"`{file}`", *(str(sum(row.get(x, 0) for row in own)) for x in ("passed", "failed", "refused"))])
+    return markdown(rows)
+
+
+def by_strategy(cells: Sequence[Row], page: Path) -> list[str]:
+    """Small trainings, with their PSNR on held-out photographs."""
+    rows = [["capture", "strategy", "steps", "Gaussians", "PSNR", "processor's s"]]
+    for row in cells:
+        told = [f"{row['scene']}, {row['size']}", row["strategy"], str(row["steps"]), f"{row['gaussians']:,}"]
+        rows.append([*told, f"{row['psnr']:.2f}", f"{row['seconds']:.0f}"])
+    return markdown(rows)
+
+
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
     score = next(iter(scores_of(row)))
@@ -263,6 +296,9 @@ KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "strangers": by_verdict,
     "minute": by_seconds,
     "reading": by_program,
+    "parameters": by_parameter,
+    "owntests": by_test,
+    "trainings": by_strategy,
 }
 OTHERS = {
     "sections": "gallery",
@@ -270,6 +306,9 @@ OTHERS = {
     "strangers": "strangers",
     "minute": "minute",
     "reading": "reading",
+    "parameters": "parameters",
+    "owntests": "owntests",
+    "trainings": "trainings",
 }  # where the figures of a table are
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
     from .gaussians.rasterization import rasterization as rasterization
+    from .gsplat import rasterization_2dgs as rasterization_2dgs
     from .large import open_any as open_any
     from .method import Method as Method
     from .method import RayMethod as RayMethod
@@ -78,6 +79,7 @@ _homes = {
     "open_scene": "opening",
     "rasterization": "gaussians.rasterization",
     "sample": "api",
+    "rasterization_2dgs": "gsplat.rendering",
     "train": "api",
 }
 __all__ = sorted(_homes)

@@ -29,7 +29,7 @@ from lumigraph.light.probes import write_probes
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.run import build
 
-pytestmark = budget("runs", 12)
+pytestmark = budget("runs", 24)
 
 ROOT = PACKAGE.parent
 SECONDS = {"seconds=30.0": "steps=2"}  # of the block of docs/convert.md
@@ -66,9 +66,30 @@ def in_folder_of_runs(ball_run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+FAMILIES = ("splats", "a hash grid", "a triplane", "a surface")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_loops_of_ones_own_learn(family, monkeypatch):
+    """Each block of docs/build.md in fewer steps, of at most 60 lines."""
+    monkeypatch.setattr(lumigraph, "open_scene", lambda source: tiny.scene())
+    source = blocks()["docs/build.md"][FAMILIES.index(family)]
+    assert len([line for line in source.splitlines() if line]) <= 60
+    fewer = re.sub(r"(?m)^(STEPS.*?) = \d+", r"\1 = 60", source, count=1)
+    fewer = re.sub(r"(?m)^(STEPS, RAYS.* = 60), \d+, \d+", r"\1, 256, 32", fewer)
+    fewer = fewer.replace("STEPS, COUNT = 60, 2000", "STEPS, COUNT = 60, 500")
+    assert "= 60" in fewer
+    names: dict[str, Any] = {}
+    exec(compile(fewer, f"docs/build.md, {family}", "exec"), names)
+    first, last = (sum(part) / 5 for part in (names["losses"][:5], names["losses"][-5:]))
+    assert last < 0.6 * first
+    assert family != "splats" or len(names["params"]["means"]) != 500  # density control changed the cloud
+
+
 def test_every_block_has_a_test():
     tested = {
         "README.md",
+        "docs/build.md",
         "docs/cleaning.md",
         "docs/compress.md",
         "docs/convert.md",

@@ -42,7 +42,7 @@ FLOORS: list[set[str]] = [
     {"components", "readers", "selection"},
     {"composition", "sfm", "synthetic"},
     {"methods", "opening", "viewer"},
-    {"run"},
+    {"gsplat", "run"},
     {"export", "training"},
     {"evaluation", "large"},
     {"derive"},

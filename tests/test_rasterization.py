@@ -175,15 +175,189 @@ def test_far_and_small_gaussians_are_left_out():
     assert lumigraph.rasterization(**given, **asked, radius_clip=1e3)[1].max() == 0
 
 
+def rays_in(points, intrinsics, model):
+    """Pixels of points in the camera's frame, of each camera model's equation."""
+    x, y, z = points.unbind(-1)
+    if model == "ortho":
+        flat = points[..., :2]
+    elif model == "fisheye":
+        r = torch.hypot(x, y)
+        flat = points[..., :2] * (torch.atan2(r, z) / r)[..., None]
+    else:
+        flat = points[..., :2] / z[..., None]
+    return flat * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
+
+
+def exactly(given, viewmat, intrinsics, model="pinhole", antialiased=False, blur=0.3, exclusive=True, spread=None):
+    """One picture of the equations in float64: the Jacobian is autograd's. spread: gets absolute gradients."""
+    seen = given["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    if "covars" in given:
+        covariance = viewmat[:3, :3] @ given["covars"] @ viewmat[:3, :3].T
+    else:
+        axes = viewmat[:3, :3] @ to_matrix(given["quats"]) @ torch.diag_embed(given["scales"])
+        covariance = axes @ axes.mT
+    jacobian = torch.func.vmap(torch.func.jacrev(lambda p: rays_in(p, intrinsics, model)))(seen)
+    narrow = jacobian @ covariance @ jacobian.mT
+    flat = narrow + blur * torch.eye(2, dtype=narrow.dtype)
+    factor = (narrow.det() / flat.det()).clamp_min(0.005**2).sqrt() if antialiased else 1.0
+    row, column = torch.meshgrid(torch.arange(SIZE[1]) + 0.5, torch.arange(SIZE[0]) + 0.5, indexing="ij")
+    away = torch.stack([column, row], -1)[..., None, :].to(narrow) - rays_in(seen, intrinsics, model)
+    if spread is not None:
+        away.register_hook(lambda g: (spread.add_(g.abs().sum((0, 1))), None)[1])
+    raw = given["opacities"] * factor * torch.exp(-0.5 * torch.einsum("hwni,nij,hwnj->hwn", away, flat.inverse(), away))
+    alpha = torch.where(raw < 1 / 255, 0.0, raw.clamp(max=0.99))
+    order = seen[:, 2].argsort()
+    alpha, values = alpha[..., order], torch.cat([given["colors"], seen[:, 2:]], -1)[order]
+    light = torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0).cumprod(-1)
+    ended = light[..., 1:] <= 1e-4 if exclusive else light[..., :-1] < 1e-4
+    weights = torch.where(ended, 0.0, alpha * light[..., :-1])
+    return weights @ values, weights.sum(-1)
+
+
+def largest(found, wanted):
+    """Largest error, of the largest value."""
+    return float((found.double() - wanted).abs().max() / wanted.abs().max().clamp_min(1e-9))
+
+
+WAYS = {
+    "ortho": ({"camera_model": "ortho"}, {"model": "ortho"}),
+    "fisheye": ({"camera_model": "fisheye"}, {"model": "fisheye"}),
+    "antialiased": ({"rasterize_mode": "antialiased"}, {"antialiased": True}),
+    "antialiased fisheye": (
+        {"rasterize_mode": "antialiased", "camera_model": "fisheye"},
+        {"antialiased": True, "model": "fisheye"},
+    ),
+    "covars": ({"covars": True}, {}),
+    "eps2d": ({"eps2d": 0.05}, {"blur": 0.05}),
+    "last": ({"include_last": True}, {"exclusive": False}),
+    "not last": ({}, {}),
+    "float64": ({"double": True}, {}),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_way_has_values_and_gradients_of_its_equations(way):
+    options, exact = WAYS[way]
+    options, given, (viewmats, intrinsics) = dict(options), cloud(), cameras(1)
+    if "last" in way:
+        given["opacities"] = 0.9 + 0.09 * torch.rand(12)
+    if options.get("camera_model") == "ortho":
+        intrinsics[:, [0, 1], [0, 1]] /= 3
+    if options.pop("double", False):
+        given = {name: value.double() for name, value in given.items()}
+    if options.pop("covars", False):
+        axes = to_matrix(given["quats"]) * given["scales"][:, None]
+        given = {**given, "covars": axes @ axes.mT}
+        given.pop("quats"), given.pop("scales")
+    truth = {name: value.detach().double().requires_grad_() for name, value in given.items()}
+    ours = {name: value.detach().clone().requires_grad_() for name, value in given.items()}
+    poses = viewmats.clone().requires_grad_()
+    spare = {} if "quats" in ours else {"quats": None, "scales": None}
+    sizes = {"Ks": intrinsics, "width": SIZE[0], "height": SIZE[1], "render_mode": "RGB+D", "absgrad": True}
+    picture, alpha, info = lumigraph.rasterization(**ours, **spare, viewmats=poses, **sizes, **options)
+    spread = torch.zeros(12, 2, dtype=torch.float64)
+    pose = viewmats[0].double().requires_grad_()
+    values, opacity = exactly(truth, pose, intrinsics[0].double(), **exact, spread=spread)
+    weight = torch.rand(SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(0)).double() - 0.3
+    (torch.cat([picture[0], alpha[0]], -1).double() * weight).sum().backward()
+    (torch.cat([values, opacity[..., None]], -1) * weight).sum().backward()
+    assert largest(picture[0], values) < 1e-4 and largest(alpha[0, ..., 0], opacity) < 1e-4
+    for name in truth:
+        assert largest(ours[name].grad, truth[name].grad) < 1e-4, name
+    assert largest(poses.grad[0, :3, 3], pose.grad[:3, 3]) < 1e-4
+    assert largest(info["means2d"].absgrad, spread[info["gaussian_ids"]]) < 1e-4
+    assert "last" not in way or float((1 - opacity).min()) < 1e-2
+
+
+def test_the_unscented_transform_of_a_straight_lens_is_nearly_the_affine_one():
+    """Small Gaussians, where a lens is straight; and distortion moves centres as OpenCV's equation does."""
+    given, (viewmats, intrinsics) = cloud(), cameras(1)
+    given["scales"] *= 0.02
+    asked = {"viewmats": viewmats, "Ks": intrinsics, "width": SIZE[0], "height": SIZE[1], "packed": False}
+    for model in ("pinhole", "fisheye"):
+        plain = lumigraph.rasterization(**given, **asked, camera_model=model)[0]
+        bent, _, info = lumigraph.rasterization(**given, **asked, camera_model=model, with_ut=True)
+        torch.testing.assert_close(bent, plain, atol=2e-3, rtol=0)
+    coefficients = {"radial_coeffs": torch.tensor([[0.1, 0.02, 0.0, 0.0, 0.0, 0.0]]),
+                    "tangential_coeffs": torch.tensor([[0.01, -0.02]])}  # fmt: skip
+    _, _, info = lumigraph.rasterization(**given, **asked, with_ut=True, **coefficients)
+    seen = given["means"] @ viewmats[0, :3, :3].T + viewmats[0, :3, 3]
+    x, y = (seen[:, :2] / seen[:, 2:]).unbind(-1)
+    r = x * x + y * y
+    q = 1 + 0.1 * r + 0.02 * r * r
+    bent = torch.stack(
+        [x * q + 0.02 * x * y - 0.02 * (r + 2 * x * x), y * q + 0.01 * (r + 2 * y * y) - 0.04 * x * y], -1
+    )
+    shown = (info["radii"][0] > 0).all(-1)
+    wanted = bent * intrinsics[0, [0, 1], [0, 1]] + intrinsics[0, :2, 2]
+    torch.testing.assert_close(info["means2d"][0][shown], wanted[shown], atol=1e-3, rtol=0)
+    assert shown.sum() > 6
+
+
+def test_batches_colours_of_cameras_signals_and_background_are_those_of_single_calls():
+    clouds, (viewmats, intrinsics) = [cloud(channels=5), cloud(channels=5)], cameras()
+    clouds[1]["means"] = clouds[1]["means"] + 0.1
+    for given in clouds:
+        given["colors"] = torch.stack([given["colors"], given["colors"].flip(-1)])  # of two cameras
+    both = {name: torch.stack([x[name] for x in clouds]) for name in clouds[0]}
+    asked = {"width": SIZE[0], "height": SIZE[1], "render_mode": "RGB+ED"}
+    backgrounds, signals = torch.rand(2, 2, 5), torch.rand(2, 12, 4)
+    for packed in (True, False):
+        picture, alpha, info = lumigraph.rasterization(
+            **both, viewmats=viewmats.expand(2, 2, 4, 4), Ks=intrinsics.expand(2, 2, 3, 3), **asked, packed=packed,
+            backgrounds=backgrounds, extra_signals=signals)  # fmt: skip
+        assert info["n_batches"] == 2 and info["render_extra_signals"].shape == (2, 2, SIZE[1], SIZE[0], 4)
+        for b in range(2):
+            for c in range(2):
+                own = {**clouds[b], "colors": clouds[b]["colors"][c]}
+                camera = {"viewmats": viewmats[c : c + 1], "Ks": intrinsics[c : c + 1]}
+                one, _, _ = lumigraph.rasterization(**own, **camera, **asked, backgrounds=backgrounds[b, c][None])
+                torch.testing.assert_close(picture[b, c], one[0])
+                extra, _, _ = lumigraph.rasterization(**{**own, "colors": signals[b]}, **camera, **asked)
+                torch.testing.assert_close(info["render_extra_signals"][b, c], extra[0, ..., :4])
+        if packed:
+            assert set(info["batch_ids"].tolist()) == {0, 1} == set(info["camera_ids"].tolist())
+    depth = lumigraph.rasterization(
+        **{**clouds[0], "colors": None}, viewmats=viewmats, Ks=intrinsics, width=20, height=16, render_mode="ED"
+    )[0]
+    torch.testing.assert_close(depth[..., 0], picture[0, ..., -1])
+
+
+def test_harmonics_of_degree_four_are_orthonormal_and_lists_of_tiles_hold_each_pair():
+    from lumigraph.gaussians.rasterization import harmonics
+
+    random = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=random), dim=-1)
+    basis = harmonics(directions, 4)
+    product = basis.T @ basis * 4 * torch.pi / len(directions)
+    assert float((product - torch.eye(25)).abs().max()) < 0.03
+    given, (viewmats, intrinsics) = cloud(), cameras()
+    picture, _, info = lumigraph.rasterization(
+        **given, viewmats=viewmats, Ks=intrinsics, width=20, height=16, tile_size=8
+    )
+    from lumigraph import gsplat
+
+    for masked in (False, True):
+        masks = torch.ones(2, 2, 3, dtype=torch.bool)
+        masks[1, 0, 1] = not masked
+        again, alpha = gsplat.rasterize_to_pixels(
+            info["means2d"], info["conics"], given["colors"][info["gaussian_ids"]], info["opacities"], 20, 16, 8,
+            info["isect_offsets"], info["flatten_ids"], masks=masks, packed=True)  # fmt: skip
+        shown = masks.repeat_interleave(8, 1).repeat_interleave(8, 2)[:, :16, :20]
+        torch.testing.assert_close(again, picture * shown[..., None])
+    assert "isect_ids" in info and int(info["tiles_per_gauss"].sum()) == len(info["isect_ids"])
+
+
 @pytest.mark.parametrize(
     "option",
     [
         {"render_mode": "RGD"},
         {"rasterize_mode": "sharp"},
-        {"absgrad": True},
-        {"camera_model": "fisheye"},
-        {"sh_degree": 4},
-        {"with_ut": True},
+        {"camera_model": "ftheta"},
+        {"sh_degree": 5},
+        {"with_eval3d": True},
+        {"rays": torch.zeros(1)},
+        {"distributed": True},
     ],
 )
 def test_what_there_is_not_is_refused_in_one_sentence(option):

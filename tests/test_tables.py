@@ -12,7 +12,7 @@ from budgets import budget
 pytestmark = budget("house")
 
 RESULTS = tables.read()
-WITH_TABLES = {"README.md", "benchmarks.md", "grids.md"}
+WITH_TABLES = {"README.md", "benchmarks.md", "grids.md", "python.md"}
 
 
 def test_pages_have_the_figures_of_the_results():

@@ -13,7 +13,7 @@ from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, Steps
 from ...geometry import to_matrix
 from .addition import Step, TrainingViews
-from .cloud import Cloud
+from .cloud import Cloud, GrowingCloud
 from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
 
 MAX_CLONED_SCALE = 0.01  # deviation, of the extent, up to which a Gaussian is cloned and not split
@@ -103,7 +103,7 @@ class AdaptiveDensity(DensityControl):
         self.visible_count += visible
 
     @torch.no_grad()
-    def refine(self, cloud: Cloud, extent: float, cap: int, generator: torch.Generator) -> bool:
+    def refine(self, cloud: GrowingCloud, extent: float, cap: int, generator: torch.Generator) -> bool:
         """Clone, split and prune. Returns whether the cap prevented some clones or splits."""
         gradient = self.positional_gradient_sum / self.visible_count.clamp_min(1)
         kept = (~(cloud.opacities.sigmoid() < PRUNE_OPACITY)).nonzero()[:, 0]
@@ -134,7 +134,7 @@ def largest(rows: Int[Tensor, " candidate"], score: Float[Tensor, " gaussian"], 
 
 @torch.no_grad()
 def add_copies(
-    cloud: Cloud, kept: Int[Tensor, " kept"], copied: Int[Tensor, " copied"], divided: Int[Tensor, " divided"]
+    cloud: GrowingCloud, kept: Int[Tensor, " kept"], copied: Int[Tensor, " copied"], divided: Int[Tensor, " divided"]
 ) -> tuple[Bool[Tensor, " new"], Bool[Tensor, " new"]]:
     """Rebuild a cloud of the rows that are kept, and copies behind them. Returns masks of both halves of divided rows,
     whose moments are zero, and of the copies."""
@@ -148,7 +148,7 @@ def add_copies(
 
 
 @torch.no_grad()
-def scatter(cloud: Cloud, split: Bool[Tensor, " gaussian"], generator: torch.Generator) -> None:
+def scatter(cloud: GrowingCloud, split: Bool[Tensor, " gaussian"], generator: torch.Generator) -> None:
     """Move the two halves of each split Gaussian to random samples of it, and scale them by 1 / 1.6 (section 5.2)."""
     some = cloud.gaussians()[split]
     offset = torch.randn(len(some), 3, generator=generator).to(some.means.device) * some.log_scales.exp()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -51,6 +51,21 @@ class RateNumbers:
     sh_lr: LearningRate = SH_LR  # learning rate of colours; a twentieth of it beyond the first band
     scales_lr: LearningRate = SCALES_LR  # learning rate of log scales
     quaternions_lr: LearningRate = QUATERNIONS_LR  # learning rate of rotations
+
+
+@runtime_checkable
+class GrowingCloud(Protocol):
+    """Gaussians that density control may rebuild: a `Cloud`, or a `TensorCloud` of a dictionary's tensors."""
+
+    means: Any
+    log_scales: Any
+    opacities: Any
+
+    def __len__(self) -> int: ...
+
+    def gaussians(self) -> Gaussians: ...
+
+    def rebuild(self, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None: ...
 
 
 class Cloud(Part):

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...geometry import to_matrix
 from .adaptive import AdaptiveDensity, add_copies, largest
 from .addition import Step
-from .cloud import Cloud
+from .cloud import GrowingCloud
 from .density_control import PRUNE_OPACITY
 
 HALF_SCALE = 1 / math.sqrt(2)  # of the longest axis of a divided Gaussian, in terms of its former deviation
@@ -39,7 +39,7 @@ class ErrorDensity(AdaptiveDensity):
         self.explained += step.explained.grad
 
     @torch.no_grad()
-    def refine(self, cloud: Cloud, extent: float, cap: int, generator: torch.Generator) -> bool:
+    def refine(self, cloud: GrowingCloud, extent: float, cap: int, generator: torch.Generator) -> bool:
         """Prune and divide. Returns whether the cap prevented some divisions."""
         kept = (cloud.opacities.sigmoid() >= PRUNE_OPACITY).nonzero()[:, 0]
         wanted = kept[self.explained[kept] > 0]
@@ -57,7 +57,7 @@ def pixel_errors(step: Step) -> Float[Tensor, "height width"]:
 
 
 @torch.no_grad()
-def divide(cloud: Cloud, halves: Bool[Tensor, " gaussian"], side: Float[Tensor, " half"]) -> None:
+def divide(cloud: GrowingCloud, halves: Bool[Tensor, " gaussian"], side: Float[Tensor, " half"]) -> None:
     """Move two copies of a Gaussian apart along its axes, and shrink them, in place.
 
     With deviations s_i and the longest one s,

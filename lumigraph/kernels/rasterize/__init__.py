@@ -20,20 +20,28 @@ def rasterize(
     depths: Float[Tensor, " gaussian"],
     tiles: Tiles,
     stop: float = 1e-4,
+    exclusive: bool = False,
+    spread: Tensor | None = None,
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Composite each pixel's Gaussians in the order of its tile's list (Kerbl 2023, eq. 3 and appendix C).
 
         a_i = min(0.99, opacity_i exp(-d^T conic_i d / 2))      d from its centre to the pixel's; 0 if below 1/255
         T_i = prod_{j<i} (1 - a_j)      transmittance
-        w_i = a_i T_i                   0 once T_i < stop
+        w_i = a_i T_i                   0 once T_i < stop; with `exclusive` once T_i (1 - a_i) <= stop
 
     Returns sum_i w_i colour_i (H, W, 3), sum_i w_i depth_i (H, W) and sum_i w_i (H, W). All are differentiable in the
     five tensors; a_i clamped to 0.99 has no gradient.
+
+    exclusive: leave out the Gaussian that ends a ray, as gsplat does
+    spread: (N, 2), to which the backward pass adds sum |dL / d centre| over pixels (Ye 2024, arXiv 2404.10484)
     """
     require(len(tiles.starts) == tiles.across * tiles.down + 1, "the tiles do not cover their picture")
     require_starts("tiles.starts", tiles.starts, len(tiles.order))
     require_indices("tiles.order", tiles.order, len(centres))
-    return implementation("rasterize", centres)(centres, conics, opacities, colours, depths, tiles, stop)
+    require(spread is None or spread.shape == centres.shape, "spread must have the shape of the centres")
+    return implementation("rasterize", centres)(
+        centres, conics, opacities, colours, depths, tiles, stop, exclusive, spread
+    )
 
 
 def cases(generator: torch.Generator):
@@ -58,6 +66,8 @@ def cases(generator: torch.Generator):
     opacities[40:60] = 0.0
     yield _steady(centres, conics, opacities, depths, (37, 50), 16, 1e-4, generator)
     yield _steady(centres[:60], conics[:60], opacities[:60] / 4, depths[:60], (37, 50), 32, 0.0, generator)
+    centres, conics, opacities, depths = footprints(100, (37, 50), generator)
+    yield *_steady(centres, conics, 0.5 + opacities / 2, depths, (37, 50), 32, 1e-2, generator), True
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
@@ -82,7 +92,8 @@ def _steady(centres, conics, opacities, depths, size, side, stop, generator):
         bad = torch.zeros(len(centres), dtype=torch.bool)
         for numbers, _, raw, before in light(centres.double(), conics.double(), opacities.double(), tiles, stop):
             near = torch.zeros_like(raw, dtype=torch.bool)
-            for value, threshold in ((raw, MIN_ALPHA), (raw, MAX_ALPHA), (before, stop)):
+            behind = before * (1 - raw.clamp(max=MAX_ALPHA))
+            for value, threshold in ((raw, MIN_ALPHA), (raw, MAX_ALPHA), (before, stop), (behind, stop)):
                 near |= (value / max(threshold, 1e-12) - 1).abs() < 1e-3
             bad[numbers] |= near.any(0)
         if not bad.any():

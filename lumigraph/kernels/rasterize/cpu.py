@@ -113,6 +113,12 @@ def _alpha(exponent, transmittance, stop):
 
 
 @njit(inline="always")
+def _ends(alpha, transmittance, stop):
+    """Lanes in which the Gaussian at hand brings a ray below `stop`; with `exclusive` it then adds nothing."""
+    return (transmittance >= stop) & (stop >= transmittance - alpha * transmittance)
+
+
+@njit(inline="always")
 def _span(n, side, first):
     """Number of a tile's rows or columns of blocks inside the picture."""
     return (min(side, n - first) + 3) // 4
@@ -133,7 +139,7 @@ def _all_blocks(columns, rows):
 
 
 @njit(parallel=True, **FAST)
-def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, opacity, masks, visits):
+def _forward(rows, order, starts, shares, size, side, stop, exclusive, table, rgb, depth, opacity, masks, visits):
     width, height = size
     across = (width + side - 1) // side
     for share in prange(len(shares) - 1):
@@ -161,7 +167,12 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
                     at = block * (5 * LANES)
                     _, _, exponent = _bell(rows, i, frame, table, block)
                     transmittance = fetch(state, at)
-                    weight = _alpha(exponent, transmittance, stop) * transmittance
+                    alpha = _alpha(exponent, transmittance, stop)
+                    if exclusive is not None:  # a ray that has ended keeps its transmittance, negative
+                        ends = _ends(alpha, transmittance, stop)
+                        alpha = where(ends, ZERO, alpha)
+                        transmittance = where(ends, -ONE * transmittance, transmittance)
+                    weight = alpha * transmittance
                     transmittance = transmittance - weight
                     put(state, at, transmittance)
                     for c in range(4):
@@ -174,7 +185,7 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
                     at = _place(x, y, 5)
-                    opacity[top + y, left + x] = ONE - state[at]
+                    opacity[top + y, left + x] = ONE - abs(state[at])
                     for c in range(3):
                         rgb[top + y, left + x, c] = state[at + (c + 1) * LANES]
                     depth[top + y, left + x] = state[at + 4 * LANES]
@@ -182,13 +193,15 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
 
 @njit(parallel=True, **FAST)
 def _backward(
-    to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, table, masks, sums
-):
+    to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, exclusive, table,
+    masks, sums, spread
+):  # fmt: skip
     """Gradients, with c_i = dL/dw_i and a_i = opacity exp(-q / 2) where that is not clamped,
 
         dL / d ln a_i = w_i c_i - a_i / (1 - a_i) sum_{j>i} w_j c_j
 
     weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb and sum w_i dL/ddepth.
+    With `spread` also sums of the absolute values of the gradient in the centre.
     """
     width, height = size
     across = (width + side - 1) // side
@@ -214,7 +227,7 @@ def _backward(
                 i = np.int64(order[p]) * LANES
                 ahead(rows, np.int64(order[min(p + AHEAD, len(order) - 1)]) * LANES)
                 frame = _frame(rows, i, left, top)
-                s = su = sv = suu = suv = svv = red = green = blue = far = filled(ZERO, SIXTEEN)
+                s = su = sv = suu = suv = svv = red = green = blue = far = across_x = across_y = filled(ZERO, SIXTEEN)
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
@@ -222,6 +235,10 @@ def _backward(
                     u, v, exponent = _bell(rows, i, frame, table, block)
                     transmittance = fetch(state, at)
                     alpha = _alpha(exponent, transmittance, stop)
+                    if exclusive is not None:
+                        ends = _ends(alpha, transmittance, stop)
+                        alpha = where(ends, ZERO, alpha)
+                        transmittance = where(ends, -ONE * transmittance, transmittance)
                     weight = alpha * transmittance
                     put(state, at, transmittance - weight)
                     r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
@@ -233,14 +250,19 @@ def _backward(
                     slope = gw - alpha * sum_gw / (ONE - alpha)
                     slope = where(alpha < MAX_ALPHA, slope, ZERO)
                     gu, gv = slope * u, slope * v
+                    if spread is not None:
+                        x, y = frame[0] * gu, frame[1] * gu + frame[2] * gv
+                        across_x, across_y = across_x + highest(x, -ONE * x), across_y + highest(y, -ONE * y)
                     s, su, sv = s + slope, su + gu, sv + gv
                     suu, suv, svv = suu + gu * u, suv + gu * v, svv + gv * v
                     red, green, blue, far = red + weight * r, green + weight * g, blue + weight * b, far + weight * d
-                put(sums, p * LANES, totals((s, su, sv, suu, suv, svv, red, green, blue, far)))
+                put(sums, p * LANES, totals((s, su, sv, suu, suv, svv, red, green, blue, far, across_x, across_y)))
 
 
 @njit(parallel=True, **FAST)
-def _gather(sums, masks, order, rows, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
+def _gather(
+    sums, masks, order, rows, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths, spread
+):
     """Gradients from the sums. Each thread adds up its own Gaussians, in the order of tiles."""
     n = len(to_depths)
     for part in prange(parts):
@@ -267,6 +289,9 @@ def _gather(sums, masks, order, rows, opacities, parts, to_centres, to_conics, t
             for k in range(3):
                 to_colours[i, k] = s[6 + k]
             to_depths[i] = s[9]
+            if spread is not None:
+                spread[i, 0] += LN_4 * s[10]
+                spread[i, 1] += LN_4 * s[11]
 
 
 def _shares(work):
@@ -276,7 +301,7 @@ def _shares(work):
     return np.concatenate([[0], cuts, [len(work)]])
 
 
-def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop, exclusive=False, spread=None):
     width, height = tiles.size
     order, starts = tiles.order.numpy(), tiles.starts.numpy()
     rows = np.empty(len(centres) * LANES, np.float32)
@@ -284,7 +309,8 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
     work = np.diff(starts) + TILE
     masks, visits = np.empty(len(order), np.uint64), np.empty(len(work), np.int64)
-    ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE.ravel()
+    ctx.numbers = tiles.size, tiles.side, np.float32(stop), True if exclusive else None, TABLE.ravel()
+    ctx.spread = None if spread is None else spread.numpy()
     pictures = (x.numpy() for x in (rgb, depth, opacity))
     _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
     ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
@@ -295,10 +321,12 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
 def backward(ctx, *grads):
     (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
     n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
-    _backward(*(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
+    _backward(
+        *(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums, ctx.spread
+    )
     results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
-    _gather(sums, masks, order, rows, saved[3], get_num_threads(), *(x.numpy() for x in results))
-    return *results, None, None
+    _gather(sums, masks, order, rows, saved[3], get_num_threads(), *(x.numpy() for x in results), ctx.spread)
+    return *results, None, None, None, None
 
 
 run = differentiable(forward, backward)

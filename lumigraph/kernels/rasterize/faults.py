@@ -3,7 +3,7 @@
 FAULTS = {
     "light not lost": ("gpu", "_backward", "gw_behind / (1 - alpha)", "gw_behind"),
     "cut off, yet with gradient": ("gpu", "_backward", " & (raw <= MAX_ALPHA)", ""),
-    "an opacity behind the stop": ("gpu", "_backward", " & (T >= stop)", ""),
+    "an opacity behind the stop": ("gpu", "_backward", " & (ended == 0)", ""),
     "all that is behind, again": ("gpu", "_backward", "rest -= tl.sum(w * g_w, 0)", "rest -= 0"),
     "the other axis": ("gpu", "_backward", "conic[2] * sum_y", "conic[0] * sum_y"),
     "a block too few": ("cpu", "_blocks", "np.float32(1.5)", "np.float32(0.5)"),

@@ -56,7 +56,7 @@ def _steady(conic):
 
 
 @triton.jit
-def _light(dx, dy, conic, opacity, transmittance, stop):
+def _light(dx, dy, conic, opacity, transmittance, stop, EXCLUSIVE: tl.constexpr):
     """Gaussian by pixel: opacity before and after thresholds, transmittance T before and behind each, and weight w."""
     a, tilt, rest = _steady(conic)
     t = tl.fma(tilt[:, None], dy, dx)
@@ -64,7 +64,8 @@ def _light(dx, dy, conic, opacity, transmittance, stop):
     alpha = tl.where(raw < MIN_ALPHA, 0.0, tl.minimum(raw, MAX_ALPHA))
     T_next = transmittance[None, :] * tl.cumprod(1 - alpha, 0)
     T = T_next / (1 - alpha)
-    return raw, alpha, T, T_next, tl.where(T < stop, 0.0, alpha * T)
+    ended = T_next <= stop if EXCLUSIVE else T < stop
+    return raw, alpha, T, T_next, tl.where(ended, 0.0, alpha * T), ended
 
 
 @triton.jit
@@ -76,7 +77,10 @@ def _of_pixel(outputs, at, inside):
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def _forward(gaussians, order, starts, outputs, width, height, stop, SIDE: tl.constexpr, SQUARE: tl.constexpr):
+def _forward(
+    gaussians, order, starts, outputs, width, height, stop, SIDE: tl.constexpr, SQUARE: tl.constexpr,
+    EXCLUSIVE: tl.constexpr
+):  # fmt: skip
     picture, depth, weight = outputs
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
@@ -87,7 +91,7 @@ def _forward(gaussians, order, starts, outputs, width, height, stop, SIDE: tl.co
         i = first + tl.arange(0, GAUSSIANS)
         _, centre, conic, opacity, v = _gaussians(i, i < last, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
-        _, _, _, T_next, w = _light(dx, dy, conic, opacity, transmittance, stop)
+        _, _, _, T_next, w, _ = _light(dx, dy, conic, opacity, transmittance, stop, EXCLUSIVE)
         red += tl.sum(w * v[0][:, None], 0)
         green += tl.sum(w * v[1][:, None], 0)
         blue += tl.sum(w * v[2][:, None], 0)
@@ -108,8 +112,9 @@ def _add(pointer, n, value, here):
 
 @triton.jit(do_not_specialize=["width", "height"])
 def _backward(
-    grads, gaussians, order, starts, outputs, found, width, height, stop, SIDE: tl.constexpr, SQUARE: tl.constexpr
-):
+    grads, gaussians, order, starts, outputs, found, spread, width, height, stop, SIDE: tl.constexpr,
+    SQUARE: tl.constexpr, EXCLUSIVE: tl.constexpr, SPREADS: tl.constexpr
+):  # fmt: skip
     d_centres, d_conics, d_opacities, d_colours, d_depths = found
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
@@ -122,11 +127,11 @@ def _backward(
         here = i < last
         n, centre, conic, opacity, v = _gaussians(i, here, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
-        raw, alpha, T, T_next, w = _light(dx, dy, conic, opacity, transmittance, stop)
+        raw, alpha, T, T_next, w, ended = _light(dx, dy, conic, opacity, transmittance, stop, EXCLUSIVE)
         g_w = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
         g_w += v[3][:, None] * g[3][None, :] + g[4][None, :]
         gw_behind = rest[None, :] - tl.cumsum(w * g_w, 0)
-        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (T >= stop)
+        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (ended == 0)
         d_power = tl.where(moves, raw * (T * g_w - gw_behind / (1 - alpha)), 0.0)
         _add(d_colours, 3 * n, tl.sum(w * g[0][None, :], 1), here)
         _add(d_colours, 3 * n + 1, tl.sum(w * g[1][None, :], 1), here)
@@ -136,6 +141,11 @@ def _backward(
         sum_x, sum_y = tl.sum(d_power * dx, 1), tl.sum(d_power * dy, 1)
         _add(d_centres, 2 * n, conic[0] * sum_x + conic[1] * sum_y, here)
         _add(d_centres, 2 * n + 1, conic[1] * sum_x + conic[2] * sum_y, here)
+        if SPREADS:
+            to_x = tl.abs(d_power * (conic[0][:, None] * dx + conic[1][:, None] * dy))
+            to_y = tl.abs(d_power * (conic[1][:, None] * dx + conic[2][:, None] * dy))
+            _add(spread, 2 * n, tl.sum(to_x, 1), here)
+            _add(spread, 2 * n + 1, tl.sum(to_y, 1), here)
         _add(d_conics, 3 * n, -0.5 * tl.sum(d_power * dx * dx, 1), here)
         _add(d_conics, 3 * n + 1, -tl.sum(d_power * dx * dy, 1), here)
         _add(d_conics, 3 * n + 2, -0.5 * tl.sum(d_power * dy * dy, 1), here)
@@ -144,14 +154,14 @@ def _backward(
         first += GAUSSIANS
 
 
-def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop, exclusive=False, spread=None):
     (width, height), device = tiles.size, centres.device
     gaussians = centres, conics, opacities, colours, depths
     outputs = tuple(empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width)))
     square = min(tiles.side, SQUARE)
     ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
     ctx.rest = width, height, max(float(stop), MIN_TRANSMITTANCE)
-    ctx.options = {"SIDE": tiles.side, "SQUARE": square}
+    ctx.options, ctx.spread = {"SIDE": tiles.side, "SQUARE": square, "EXCLUSIVE": exclusive}, spread
     launch(_forward, ctx.grid, gaussians, tiles.order, tiles.starts, outputs, *ctx.rest, **ctx.options)
     ctx.save_for_backward(*gaussians, tiles.order, tiles.starts, *outputs)
     return outputs
@@ -161,8 +171,9 @@ def backward(ctx, *grads):
     *gaussians, order, starts, picture, depth, weight = ctx.saved_tensors
     found = tuple(torch.zeros_like(x) for x in gaussians)
     given = grads, tuple(gaussians), order, starts, (picture, depth, weight), found
-    launch(_backward, ctx.grid, *given, *ctx.rest, **ctx.options)
-    return *found, None, None
+    spread = found[0] if ctx.spread is None else ctx.spread  # the former is not written to
+    launch(_backward, ctx.grid, *given, spread, *ctx.rest, **ctx.options, SPREADS=ctx.spread is not None)
+    return *found, None, None, None, None
 
 
 run = differentiable(forward, backward)

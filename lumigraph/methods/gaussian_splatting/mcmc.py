@@ -91,7 +91,7 @@ class MarkovChain(DensityControl):
         cloud.opacities[touched], cloud.log_scales[touched] = shared.opacities, shared.log_scales
 
 
-def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"]) -> Gaussians:
+def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"], min_opacity: float | None = None) -> Gaussians:
     """Opacity and scale of each of n copies that together render like the original (Kheradmand 2024, eq. 10).
 
     Opacity o' = 1 - (1 - o)^(1/n);
@@ -100,6 +100,8 @@ def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"]) -> Gaussi
     opacity = gaussians.opacities.double().sigmoid()
     n = copies.clamp(max=MAX_COPIES).double()
     single = 1 - (1 - opacity) ** (1 / n)
+    if min_opacity is not None:  # so that scales are those of the opacities that result
+        single = single.clamp(min_opacity, 1 - 1e-6)
     total = torch.zeros_like(single)
     for i in range(1, int(n.max()) + 1 if len(n) else 0):
         row, binomial = torch.zeros_like(single), 1.0
@@ -108,7 +110,8 @@ def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"]) -> Gaussi
             binomial *= (i - 1 - k) / (k + 1)
         total += torch.where(i <= n, row, 0)
     scales = gaussians.log_scales + (opacity / total).clamp_min(1e-6).log().float()[:, None]
-    return replace(gaussians, opacities=single.clamp(PRUNE_OPACITY, 1 - 1e-6).logit().float(), log_scales=scales)
+    least = PRUNE_OPACITY if min_opacity is None else min_opacity
+    return replace(gaussians, opacities=single.clamp(least, 1 - 1e-6).logit().float(), log_scales=scales)
 
 
 def sample_by(weights: Float[Tensor, " gaussian"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
