@@ -78,8 +78,8 @@ class Collection:
     @cached_property
     def frame(self) -> Frame:
         first, plain = self._first.frame, Frame()
-        own = {"source_from_scene": plain.source_from_scene, "metric": False}
-        return replace(first, bounds=plain.bounds, forward=None, **own)
+        scale = plain.source_from_scene
+        return replace(first, bounds=plain.bounds, forward=None, source_from_scene=scale, metric=False)
 
     @property
     def warnings(self) -> list[str]:

@@ -177,20 +177,20 @@ def read_off(path: Path) -> Any:
     texture, _, normal, weight = kind.groups() if kind else (None,) * 4
     positions = table[:, :3] / table[:, 3:4] if weight else table[:, :3]
     before = 3 + bool(weight) + 3 * bool(normal)
-    colours = table[:, before : table.shape[1] - 2 * bool(texture)][:, :3]
-    colours = bytes_of(colours) if colours.shape[1] == 3 else None
+    behind = table[:, before : table.shape[1] - 2 * bool(texture)][:, :3]
+    colours = bytes_of(behind) if behind.shape[1] == 3 else None
     faces, sizes = rows[corners : corners + polygons], [int(row[0]) for row in rows[corners : corners + polygons]]
     cornered = np.empty(polygons, object)
     cornered[:] = [np.array(row[1 : 1 + size], np.int64) for row, size in zip(faces, sizes, strict=True)]
     triangles, face = fans(cornered)
     if not len(triangles):
         return trimesh.PointCloud(positions, colours)
-    behind = [row[1 + size :] for row, size in zip(faces, sizes, strict=True)]  # one number is of a table elsewhere
-    own = [i for i, words in enumerate(behind) if len(words) >= 3]
+    further = [row[1 + size :] for row, size in zip(faces, sizes, strict=True)]  # one number is of a table elsewhere
+    own = [i for i, words in enumerate(further) if len(words) >= 3]
     of_faces: np.ndarray | None = None
     if own:
         of_faces = np.full((polygons, 3), DEFAULT_GREY, np.uint8)
-        of_faces[own] = bytes_of(np.array([behind[i][:3] for i in own], np.float64))
+        of_faces[own] = bytes_of(np.array([further[i][:3] for i in own], np.float64))
         of_faces = of_faces[face]
     return trimesh.Trimesh(positions, triangles, face_colors=of_faces, vertex_colors=colours, process=False)
 
