@@ -243,7 +243,7 @@ def test_a_fault_is_raised(call, said):
 PUBLIC_NAMES = """
 Camera Collection Dataset Evaluation Exported Film Gaussians Lens LumigraphError Method Model Opened RayMethod Rays
 Rendering Run Samples Scene Shapes call capture composite fit open open_any open_dataset open_scene rasterization
-sample train
+rasterization_2dgs sample train
 """.split()
 MODEL_NAMES = """
 clean compress convert depth_unit evaluate export film metrics opened placed render rendered

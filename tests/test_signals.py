@@ -41,7 +41,7 @@ COMMANDS = {
     "bench kernels": "lumigraph.kernels.bench.bench_kernels",
     "bench step voxel-grid SCENE": "lumigraph.lab.benchmark.step.bench_step",
     "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.lab.benchmark.conduct.conduct",
-    "view RUN": "lumigraph.viewer.at_free_address",
+    "view RUN": "lumigraph.large.open_any",
 }
 
 

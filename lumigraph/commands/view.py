@@ -49,8 +49,8 @@ class ViewCommand:
             exporter=None if self.token else export_menu(opened, method, self.settings, self.device),
             embedded=bool(self.token),
         )
-        viewer = at_free_address(self.host, self.port, self.token, partial(Viewer, method, subject))
-        with until_interrupted(), viewer:
+        start = partial(Viewer, method, subject)
+        with until_interrupted(), at_free_address(self.host, self.port, self.token, start) as viewer:
             show_address(viewer, self.token)
             viewer.serve()
         return 0
