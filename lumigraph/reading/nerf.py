@@ -16,7 +16,7 @@ from .data import BOX, photographs, psnr, save
 from .volume import composite, weights
 
 WIDTH, OCTAVES, DIRECTION_OCTAVES = 96, 6, 2  # channels of a layer; L of eq. 4 for points and for directions
-COARSE, FINE, RAYS, STEPS, RATE = 24, 24, 512, 500, 4e-3  # samples of each pass; rays of a step
+COARSE, FINE, RAYS, STEPS, RATE = 24, 24, 512, 700, 4e-3  # samples of each pass; rays of a step
 Points = Float[Tensor, "*batch 3"]
 
 

@@ -69,7 +69,7 @@ def render(net: nn.ModuleDict, o: Tensor, d: Tensor, learning: bool = False):
     t = torch.cat([near, stratified(near, far, COARSE - 1, learning), far], 1)
     with torch.no_grad():  # more samples where a surface of that distance would be
         f, _ = distance(net, o[:, None] + t[..., None] * d[:, None])
-        slope = f.diff(dim=1) / t.diff(dim=1)
+        slope = f.diff(dim=1) / t.diff(dim=1).clamp_min(1e-6)  # two samples may meet
         rough = weights(alphas((f[:, 1:] + f[:, :-1]) / 2, slope, t.diff(dim=1), 32.0))
         shares = stratified(torch.zeros_like(near), torch.ones_like(near), FINE, learning)
         t = torch.cat([t, invert(t, rough, shares)], 1).sort(1).values
