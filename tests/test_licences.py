@@ -36,7 +36,13 @@ EXCEPTIONS = {
     "nvidia-*": "NVIDIA's own: libraries of CUDA that PyTorch's build for GPUs requires; nothing of ours contains them",
     "cuda-*": "NVIDIA's own: as nvidia-*",
 }
-NOT_INSTALLED = {"pyliblzfse": "MIT, of extra `record3d`, whose wheel few systems have"}
+NOT_INSTALLED = {
+    "pyliblzfse": "MIT, of extra `record3d`, whose wheel few systems have",
+    "wandb": "MIT; hundreds of megabytes with what it needs, as the three below",
+    "trackio": "MIT",
+    "rerun-sdk": "MIT or Apache-2.0",
+    "mujoco": "Apache-2.0",
+}
 
 
 def requirements(words: Iterable[str], extras: Iterable[str] = ()) -> Iterator[Requirement]:
