@@ -94,6 +94,7 @@ def unpacked(path: Path) -> tuple[dict[str, Any], bytearray]:
         if old := material.get("extensions", {}).get(SPECULAR):
             names = {"baseColorFactor": "diffuseFactor", "baseColorTexture": "diffuseTexture"}
             material["pbrMetallicRoughness"] = {name: old[was] for name, was in names.items() if was in old}
+    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
     return about, whole
 
 
@@ -137,8 +138,9 @@ def unpack_draco(
     for name, rows in columns.items():
         accessor = about["accessors"][primitive["attributes"][name]]
         values = rows.reshape(len(rows), -1).astype(KINDS[accessor["componentType"]])
-        normalised = accessor.get("normalized", False)
-        primitive["attributes"][name] = appended(about, whole, values, accessor["type"], normalised)
+        primitive["attributes"][name] = appended(
+            about, whole, values, accessor["type"], accessor.get("normalized", False)
+        )
     primitive |= {"mode": 4, "indices": appended(about, whole, indices, "SCALAR")}
 
 
@@ -166,6 +168,7 @@ def plain(path: Path) -> bytes:
             primitive |= {"mode": 4, "indices": appended(about, whole, fan, "SCALAR")}
     for unused in ("materials", "textures", "images"):
         about.pop(unused, None)
+    about["buffers"] = [{"byteLength": len(whole)}] if whole else []
     return packed(about, whole)
 
 
@@ -246,8 +249,8 @@ def appended(about: dict[str, Any], whole: bytearray, values: np.ndarray, shape:
 
 
 def packed(about: dict[str, Any], buffer: bytes | bytearray) -> bytes:
-    """Bytes of a .glb file with one buffer."""
-    text = json.dumps(about | {"buffers": [{"byteLength": len(buffer)}] if buffer else []}).encode()
+    """Bytes of a .glb file."""
+    text = json.dumps(about).encode()
     text, buffer = text + b" " * (-len(text) % 4), buffer + bytes(-len(buffer) % 4)
     chunks = CHUNK.pack(len(text), JSON) + text + (CHUNK.pack(len(buffer), BINARY) + buffer if buffer else b"")
     return HEADER.pack(MAGIC, 2, HEADER.size + len(chunks)) + chunks
