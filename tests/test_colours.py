@@ -133,7 +133,8 @@ def test_what_is_brighter_than_white_is_rolled_off():
     light = np.array([[10.0, 10, 10], [90, 90, 90], [203, 203, 203], [600, 300, 150], [1000, 1000, 1000]], np.float32)
     shown = display.rolled_off(light, 203, 1000)
     assert (np.diff(shown.max(1)) > 0).all() and shown.max() == pytest.approx(203, rel=1e-3)
-    np.testing.assert_allclose(shown[:1], light[:1], rtol=1e-5)
+    # 1.2e-5 off where a processor's powers are of single precision, and exact where they are not
+    np.testing.assert_allclose(shown[:1], light[:1], rtol=3e-5)
     np.testing.assert_allclose(shown[3] / shown[3, 0], [1, 0.5, 0.25], rtol=1e-5)
     assert display.rolled_off(light, 203, 200) is light
 
@@ -389,7 +390,7 @@ def test_pictures_without_a_tag_hold_numbers_or_lie_in_a_page():
     package, known = Path(lumigraph.__file__).parent, {
         "app/pictures.py", "app/reduce.py", "export/page.py",  # for browsers, which take them for sRGB
         "datasets/images/stream.py", "derive/parts.py", "exchange/snerg.py", "exchange/sog.py", "export/depth.py",
-        "export/usdz.py", "light/probes/storage.py", "readers/objects/__init__.py", "sfm/folder.py",
+        "export/usdz.py", "light/probes/storage.py", "reading/data.py", "readers/objects/__init__.py", "sfm/folder.py",
     }  # fmt: skip
     untagged = re.compile(r'\.save\(.*"(PNG|JPEG|WEBP|png)"|(fromarray|to_image)\(.*\)\.save\(')
     found = {str(x.relative_to(package)) for x in package.rglob("*.py") if untagged.search(x.read_text())}

