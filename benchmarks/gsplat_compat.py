@@ -129,7 +129,7 @@ def parameters() -> Iterator[Row]:
 
 
 def sentence(option: Row) -> str:
-    """What is said of an option that is refused."""
+    """Sentence by which an option is refused."""
     given, (viewmats, Ks) = truth.cloud(), truth.cameras(1)
     try:
         lumigraph.rasterization(**given, viewmats=viewmats, Ks=Ks, width=20, height=16, **option)

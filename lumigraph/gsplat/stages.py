@@ -5,6 +5,7 @@ Plain PyTorch but for `rasterize_to_pixels`, which is the kernel.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -13,15 +14,11 @@ from torch import Tensor
 
 from ..color.blending import over
 from ..errors import LumigraphError
-from ..gaussians.projection import (
-    UnscentedTransformParameters,
-    affine,
-    check_model,
-    covariances_of,
-)
+from ..gaussians.projection import UnscentedTransformParameters, affine, check_model, covariances_of
 from ..gaussians.rasterization import CloudViews, Projecting, by_definition, composited, harmonics
 from ..gaussians.surfels import composited_discs, discs_of
 from ..gaussians.tile_lists import tiles_of
+from ..kernels.tile import Tiles
 
 TRIANGLE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # rows and columns of the upper triangle
 SQUARE = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # the inverse
@@ -253,12 +250,8 @@ def rasterize_to_pixels(
     spread = torch.zeros_like(flat[0]) if absgrad else None
     if spread is not None:
         means2d.absgrad = spread.view_as(means2d)  # type: ignore[attr-defined]
-    tiled = None if masks is None else masks.reshape(offsets.shape)
     pictures, opaque = [], []
-    for i in range(len(offsets)):
-        mask = None if tiled is None else tiled[i]
-        tiles, first, last = tiles_of(offsets, flatten_ids, i, (image_width, image_height), tile_size, mask)
-        own = slice(first, last)
+    for i, tiles, own in each_image(offsets, flatten_ids, masks, (image_width, image_height), tile_size):
         depths = torch.zeros_like(flat[2][own])
         part = None if spread is None else spread[own]
         shapes = [x[own] for x in flat]
@@ -298,11 +291,7 @@ def rasterize_to_pixels_2dgs(
     tensors = (means2d, (2,)), (nudged(ray_transforms, densify), (3, 3)), (normals, (3,)), (opacities, ())
     centres, transforms, towards, alphas = (x.reshape(-1, *tail) for x, tail in tensors)
     values, outputs = colors.reshape(-1, colors.shape[-1]), []
-    tiled = None if masks is None else masks.reshape(offsets.shape)
-    for i in range(len(offsets)):
-        mask = None if tiled is None else tiled[i]
-        tiles, first, last = tiles_of(offsets, flatten_ids, i, (image_width, image_height), tile_size, mask)
-        own = slice(first, last)
+    for i, tiles, own in each_image(offsets, flatten_ids, masks, (image_width, image_height), tile_size):
         rows = centres[own], transforms[own], towards[own], alphas[own], values[own]
         picture, further = composited_discs(*rows, tiles)
         normal, opacity, distortion, median = further.split((3, 1, 1, 1), -1)
@@ -311,6 +300,16 @@ def rasterize_to_pixels_2dgs(
         outputs.append((picture, opacity, normal, distortion, median))
     stacked = (torch.stack(x) for x in zip(*outputs, strict=True))
     return tuple(x.view(*images, *x.shape[1:]) for x in stacked)  # type: ignore[return-value]
+
+
+def each_image(
+    offsets: Int[Tensor, "image down across"], ids: Tensor, masks: Tensor | None, size: tuple[int, int], tile_size: int
+) -> Iterator[tuple[int, Tiles, slice]]:
+    """Number of each image, its tiles, and its rows."""
+    for i in range(len(offsets)):
+        mask = None if masks is None else masks.reshape(offsets.shape)[i]
+        tiles, first, last = tiles_of(offsets, ids, i, size, tile_size, mask)
+        yield i, tiles, slice(first, last)
 
 
 def nudged(transforms: Float[Tensor, "*rows 3 3"], densify: Float[Tensor, "*rows 2"]) -> Float[Tensor, "*rows 3 3"]:
