@@ -16,7 +16,7 @@ from .hashgrid import field, picture, query, train
 from .nerf import rays_of, span
 from .volume import composite, weights
 
-FIELD_STEPS, DEPTH, SAMPLES = 150, 7, 8  # levels: 2^7 cells along the longest side; directions asked in each cell
+FIELD_STEPS, DEPTH, SAMPLES = 300, 7, 8  # levels: 2^7 cells along the longest side; directions asked in each cell
 THRESHOLD, ALIKE = 1.0, 0.02  # density of an empty cell; difference of colours (and opacities) of equal ones
 Y0, Y1 = 0.28209479, 0.48860251  # constants of the first two bands of spherical harmonics
 Cells = Int[Tensor, "cell 3"]

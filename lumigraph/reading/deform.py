@@ -19,7 +19,7 @@ from .nerf import encode, rays_of
 from .volume import composite, weights
 
 SCENE, SCALE = "procedural:jelly,size=112,views=60", 0.72  # a jelly that sways; SCALE brings it into the box
-OCTAVES, TIME_OCTAVES, WIDTH, RAYS, STEPS, RATE = 3, 3, 64, 768, 320, 1e-2
+OCTAVES, TIME_OCTAVES, WIDTH, RAYS, STEPS, RATE = 3, 3, 64, 768, 320, 3e-2
 Points = Float[Tensor, "sample 3"]
 
 

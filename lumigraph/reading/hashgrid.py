@@ -19,7 +19,7 @@ LEVELS, FEATURES, ENTRIES = 8, 2, 2**15  # L, F and T of table 1, smaller
 COARSEST, FINEST = 16, 256  # N_min and N_max: cells per axis of the first and the last level
 PRIMES = 1, 2_654_435_761, 805_459_861
 CELLS, STEPS_ACROSS = 64, 128  # of the occupancy grid, per axis; marching steps along the box's longest side
-RAYS, RATE, STEPS = 1024, 1e-2, 700
+RAYS, RATE, STEPS = 1024, 2e-2, 600
 Points = Float[Tensor, "sample 3"]
 
 

@@ -15,7 +15,7 @@ from .data import photographs, psnr, save
 from .hashgrid import field, picture, render, train
 from .nerf import rays_of
 
-FIELD_STEPS, STEPS, RAYS, RATE = 120, 120, 512, 8e-3
+FIELD_STEPS, STEPS, RAYS, RATE = 300, 150, 512, 6e-3
 TURN, SHIFT = 5.0, 0.12  # the error to undo: degrees, scene units
 
 
@@ -52,8 +52,7 @@ def find(net, occupied: Tensor, image: Tensor, pose: Tensor, focal: float, truth
         chosen = interesting[torch.randint(len(interesting), (RAYS,))]
         o, d = pinhole_rays(image, moved(pose, twist), focal)
         loss = (render(net, o[chosen], d[chosen], occupied)[0] - image.view(-1, 3)[chosen]).square().mean()
-        (gradient,) = torch.autograd.grad(loss, twist)
-        twist.grad = gradient
+        twist.grad = torch.autograd.grad(loss, twist)[0]
         optimizer.step()
         if step % 20 == 0 or step == steps - 1:
             now = moved(pose, twist.detach())

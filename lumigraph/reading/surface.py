@@ -16,8 +16,8 @@ from .data import layer, photographs, psnr, save
 from .nerf import encode, invert, rays_of, span, stratified
 from .volume import composite, expected_depth
 
-WIDTH, OCTAVES, COARSE, FINE, RAYS, STEPS, RATE = 64, 5, 24, 24, 256, 450, 3e-3
-RADIUS, EIKONAL = 0.5, 0.1  # of the first sphere, scene units; lambda of eq. 17
+WIDTH, OCTAVES, COARSE, FINE, RAYS, STEPS, RATE = 64, 5, 24, 24, 256, 700, 3e-3
+RADIUS, EIKONAL, MASK = 0.5, 0.1, 0.1  # of the first sphere, scene units; lambda and beta of eq. 14
 Points = Float[Tensor, "*batch 3"]
 
 
@@ -63,7 +63,7 @@ def weights(alpha: Float[Tensor, "ray sample"]) -> Float[Tensor, "ray sample"]:
 
 
 def render(net: nn.ModuleDict, o: Tensor, d: Tensor, learning: bool = False):
-    """Colours, depths, normals of rays, and the eikonal term: the mean of (|grad f| - 1)^2 (eq. 16)."""
+    """Colours, depths, normals and opacities of rays, and the eikonal term: the mean of (|grad f| - 1)^2 (eq. 16)."""
     near, far = span(o, d)
     far = torch.maximum(far, near + 1e-3)
     t = torch.cat([near, stratified(near, far, COARSE - 1, learning), far], 1)
@@ -80,17 +80,18 @@ def render(net: nn.ModuleDict, o: Tensor, d: Tensor, learning: bool = False):
     w = weights(alphas(f, (gradient * d[:, None]).sum(-1), t.diff(dim=1), s))
     rgb = net["colour"](torch.cat([x, gradient, d[:, None].expand_as(x), features], -1)).sigmoid()
     normals = (w[..., None] * gradient).sum(1)
-    return composite(w, rgb), expected_depth(w, middle), normals, (gradient.norm(dim=-1) - 1).square().mean()
+    return composite(w, rgb), expected_depth(w, middle), normals, w.sum(1), (gradient.norm(dim=-1) - 1).square().mean()
 
 
 def train(net: nn.ModuleDict, o: Tensor, d: Tensor, truth: Tensor, steps: int = STEPS) -> list[float]:
-    """L1 of colours and the eikonal term (eq. 14). Returns the loss of each step."""
+    """L1 of colours, eikonal and mask (eq. 14): a white pixel shows nothing, else white surfaces would do as well."""
     optimizer, losses, begin = torch.optim.Adam(net.parameters(), RATE), [], time.perf_counter()
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = RATE * min(1.0, step / 20) * 0.05 ** (step / steps)
         chosen = torch.randint(len(o), (RAYS,))
-        rgb, _, _, eikonal = render(net, o[chosen], d[chosen], learning=True)
-        loss = (rgb - truth[chosen]).abs().mean() + EIKONAL * eikonal
+        rgb, _, _, opacity, eikonal = render(net, o[chosen], d[chosen], learning=True)
+        mask = nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 0.999), (truth[chosen].amin(1) < 0.99).float())
+        loss = (rgb - truth[chosen]).abs().mean() + EIKONAL * eikonal + MASK * mask
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
