@@ -56,6 +56,7 @@ settle_memory()  # as commands do: memory that one training step frees is kept f
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+LONGEST_NAME = 16  # bytes
 LEDGER = Ledger()
 event.register("numba:compile", LEDGER.compiling)
 
@@ -73,6 +74,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     LEDGER.methods = len(methods.available())
     gc.collect()
     gc.freeze()  # looking again and again through what collection made, which stays, takes a second each time
+
+
+def pytest_make_parametrize_id(val: object) -> str | None:
+    """Names of cases do not repeat the bytes of files, which may hold the moment at which they were packed."""
+    return f"{len(val)} bytes" if isinstance(val, bytes) and len(val) > LONGEST_NAME else None
 
 
 @pytest.hookimpl(wrapper=True)
