@@ -29,7 +29,7 @@ NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
 CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
 PARAMETER_RANGES = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
-PARAMETER_RANGES |= {"offset": (-1e6, 1e6)}
+PARAMETER_RANGES |= {"offset": (-1e6, 1e6), "alpha": (0.0, 1.0), "beta": (1e-3, 1e3)}
 DEFAULT_RANGE = (-1e9, 1e9)  # for further parameters of a new kind of lens
 Distorted = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]  # (x', y') and its Jacobian, row by row
 NO_INDEX = torch.empty(0, dtype=torch.int64)
@@ -415,6 +415,38 @@ class Division(FieldOfView):
     def bent(self, r: Tensor, index: Tensor | None) -> tuple[Tensor, Tensor]:
         root = 1 - 4 * rows(self.omega, index) * r * r
         return 2 * r / (1 + root.clamp_min(0).sqrt()), (root >= 0) & (r < math.tan(MAX_FLAT_ANGLE))
+
+
+@dataclass(frozen=True)
+class EnhancedUnified(Lens):
+    """Wide lens of two parameters (Khomutenko et al. 2016; COLMAP's EUCM), from (x, y, z) to the plane:
+
+    (x, y) -> (x, y) / (alpha d + (1 - alpha) z),    d^2 = beta (x^2 + y^2) + z^2
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+    alpha: Float[Tensor, "camera 1"]
+    beta: Float[Tensor, "camera 1"]
+
+    def unproject(self, pixels, index=None):
+        plane = (pixels - rows(self.centre, index)) / rows(self.focal, index)
+        alpha, beta = rows(self.alpha, index), rows(self.beta, index)
+        bent = beta * (2 * alpha - 1)  # over 0 where the plane ends, at a radius of bent^-1/2
+        plane = plane * (bent.clamp_min(1e-12).rsqrt() / plane.norm(dim=-1, keepdim=True).clamp_min(1e-6)).clamp_max(1)
+        s = plane.square().sum(-1, keepdim=True)
+        z = (1 - beta * alpha**2 * s) / (alpha * (1 - bent * s).clamp_min(0).sqrt() + 1 - alpha).clamp_min(1e-6)
+        return torch.nn.functional.normalize(torch.cat([plane, z], -1), dim=-1)
+
+    def project(self, points, index=None):
+        alpha, beta = rows(self.alpha, index), rows(self.beta, index)
+        z = points[:, 2:]
+        d = (beta * points[:, :2].square().sum(-1, keepdim=True) + z * z).sqrt()
+        below = alpha * d + (1 - alpha) * z
+        share = torch.minimum(alpha, 1 - alpha) / torch.maximum(alpha, 1 - alpha)
+        valid = (z > -share * d) & (below > 1e-6 * d)
+        pixels = points[:, :2] / torch.where(valid, below, 1) * rows(self.focal, index) + rows(self.centre, index)
+        return pixels, valid[:, 0]
 
 
 @dataclass(frozen=True)
