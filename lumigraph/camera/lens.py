@@ -620,10 +620,11 @@ def area(sides: Tensor, index: Tensor | None) -> Tensor:
 
 
 def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
-    """An index that keeps the camera axis: an int becomes a slice of length one."""
-    if isinstance(index, int):
+    """An index that keeps the camera axis: an integer, also NumPy's or a tensor, becomes a slice of length one."""
+    if getattr(index, "ndim", 0 if isinstance(index, int) else 1) == 0:
+        index = int(index)  # type: ignore[arg-type]
         return slice(index, index + 1 if index != -1 else None)
-    return index
+    return index  # type: ignore[return-value]
 
 
 def small(step: Tensor) -> bool:
