@@ -8,8 +8,8 @@ OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMI
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
 choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
-`table: reading` of `reading.py --publish`; `parameters`, `owntests`, `trainings` and `loops` of `gsplat_compat.py --publish`;
-`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+`table: reading` of `reading.py --publish`; `parameters`, `owntests`, `trainings`, `loops` of `gsplat_compat.py
+--publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations

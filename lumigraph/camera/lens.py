@@ -14,6 +14,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -105,7 +106,7 @@ class Lens(ABC):
     def __len__(self) -> int:
         return len(next(iter(self._numbers().values())))
 
-    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+    def __getitem__(self, index: int | np.integer | slice | Tensor) -> Lens:
         """The lenses of some cameras; an int gives a batch of one."""
         return self._map(lambda x: x[one_or_more(index)])
 
@@ -579,7 +580,7 @@ class Mixed(Lens):
     def __len__(self) -> int:
         return len(self.part)
 
-    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+    def __getitem__(self, index: int | np.integer | slice | Tensor) -> Lens:
         kept = one_or_more(index)
         pairs = zip(self.part[kept].tolist(), self.row[kept].tolist(), strict=True)
         return mix([self.parts[part][row] for part, row in pairs])
@@ -619,7 +620,7 @@ def area(sides: Tensor, index: Tensor | None) -> Tensor:
     return columns(sides.prod(-1, keepdim=True), index)[0]
 
 
-def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
+def one_or_more(index: int | np.integer | slice | Tensor) -> slice | Tensor:
     """An index that keeps the camera axis: an integer, also NumPy's or a tensor, becomes a slice of length one."""
     if getattr(index, "ndim", 0 if isinstance(index, int) else 1) == 0:
         index = int(index)  # type: ignore[arg-type]
