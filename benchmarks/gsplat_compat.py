@@ -304,6 +304,7 @@ def own_loop(path: Path, options: Options, seed: int) -> Row:
         optimizers["means"].param_groups[0]["lr"] = extent * 1.6e-4 * 0.01**share
         explained = torch.zeros(len(params["means"]), requires_grad=True)
         rgb, info = picture(i, behind, min(3, int(8 * share)), extra_signals=explained[:, None])
+        target = torch.where(trusted(scene.photograph(i)), target, rgb.detach())
         ssim, l1 = kernels.photometric(rgb, target)
         error = (rgb - target).detach().abs().mean(-1)
         loss = 0.8 * l1 + 0.2 * (1 - ssim) + (info["render_extra_signals"][0, ..., 0] * error / error.numel()).sum()
@@ -318,10 +319,19 @@ def own_loop(path: Path, options: Options, seed: int) -> Row:
             steps=steps, downscale=options.downscale, seed=seed, max_gaussians=cap, cap_ramp=True, refine_until=until,
             initial_gaussians=10_000)  # fmt: skip
         with torch.no_grad():
-            theirs = [psnr(model.render(scene.cameras[i]).rgb, scene.photograph(i).before(beyond[0])) for i in test]
-            ours = [psnr(picture(i, beyond, 3)[0], scene.photograph(i).before(beyond[0])) for i in test.tolist()]
+            truth = [(i, scene.photograph(i).before(beyond[0]), trusted(scene.photograph(i))) for i in test.tolist()]
+            theirs = [
+                psnr(model.render(scene.cameras[i]).rgb[kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth
+            ]
+            ours = [psnr(picture(i, beyond, 3)[0][kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth]
     return {"scene": path.name, "steps": steps, "seed": seed, "own": sum(ours) / len(ours),
             "train": sum(theirs) / len(theirs), "gaussians": len(params["means"]), "views": len(ours)}  # fmt: skip
+
+
+def trusted(photograph: Any) -> torch.Tensor:
+    """Mask of the pixels that are learnt and compared, (height, width, 1)."""
+    whole = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool)
+    return (whole if photograph.mask is None else photograph.mask)[..., None]
 
 
 def psnr(picture: torch.Tensor, target: torch.Tensor) -> float:
