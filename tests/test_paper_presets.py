@@ -364,27 +364,32 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "huber_delta": 0.0,  # squared
         "exposure_scales": True,
     },
-    "nerfactor": {  # google/nerfactor, nerfactor/config/nerfactor.ini, shape.ini and brdf.ini
+    "nerfactor": {  # google/nerfactor, a668dca: nerfactor/config/nerfactor.ini, shape.ini and brdf.ini
         "properties": "network",
         "visibility": "network",
         "reflectance": "learnt",
-        "property_layers": 4,
-        "property_width": 128,
-        "position_frequencies": 10,
-        "direction_frequencies": 4,
-        "angle_frequencies": 2,
-        "code_width": 3,
+        "property_layers": 4,  # mlp_depth
+        "property_width": 128,  # mlp_width
+        "position_frequencies": 10,  # n_freqs_xyz
+        "direction_frequencies": 4,  # n_freqs_ldir
+        "angle_frequencies": 2,  # brdf.ini, n_freqs
+        "code_width": 3,  # brdf.ini, z_dim
         "light_rows": 16,
         "surface_rays": 1024,
         "jitter": 0.01,
+        "shape_share": pytest.approx(200 / (200 + 100)),  # epochs of shape.ini and of nerfactor.ini
+        "shape_weight": 1.0,  # shape.ini, normal_loss_weight and lvis_loss_weight
+        "shape_learning_rate": 1e-2,  # shape.ini
         "normal_weight": 0.1,
         "visibility_weight": 0.1,
-        "normal_smoothness": 0.01,
-        "visibility_smoothness": 0.01,
-        "albedo_smoothness": 0.01,
+        "normal_smoothness": 0.05,
+        "visibility_smoothness": 0.05,
+        "albedo_smoothness": 0.05,
         "code_smoothness": 0.01,
         "light_variation": 5e-6,
-        "learning_rate": 1e-3,
+        "learning_rate": 5e-3,
+        "final_learning_rate": pytest.approx(4.775e-3, rel=1e-4),  # 0.1 in 500 000 steps, of which 10 000 are taken
+        "light_rate": 5e-3,
     },
     "instant-ngp": {  # the paper's table 1, sections 4 and 5.4; NVlabs/instant-ngp, configs/nerf/base.json
         "table.levels": 16,
