@@ -653,7 +653,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hyper_layers": 2,
         "hidden_width": 64,
     },
-    "deepsdf": {  # facebookresearch/DeepSDF, examples/chairs/specs.json
+    "deepsdf": {  # facebookresearch/DeepSDF, 48c19b8: examples/chairs/specs.json, train_deep_sdf.py, reconstruct.py
         "depth": 8,
         "hidden_width": 512,
         "skip_layer": 4,
@@ -662,9 +662,13 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "dropout": 0.2,
         "code": 256,
         "code_deviation": 0.01,  # section 4.2
-        "code_weight": 1e-4,
+        "code_weight": 1e-4,  # CodeRegularizationLambda
+        "code_growth": pytest.approx(100 / 2001),  # min(1, epoch / 100), of NumEpochs
+        "code_bound": 1.0,  # CodeBound
+        "fit_weight": 1e-4,  # of torch.mean(latent.pow(2))
+        "fit_learning_rate": 5e-3,
+        "code_steps": 800,
         "clamp_distance": 0.1,
-        "shapes_per_step": 8,
         "points_per_shape": 16_384,
         "points.pool_points": 500_000,  # section 5
         "points.near_spread": 0.05,  # src/PreprocessMesh.cpp: variances of 0.0025 and 0.00025
