@@ -178,7 +178,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hidden_width": 256,
         "rays.rays_per_step": 8192,
         "code_width": 256,
-        "code_weight": 1e-4,  # latent_balance
+        "code_weight": 1e-4,  # latent_balance, of the sum of norms: neural_scene_graph_helper.py, latentReg
         "box_samples": 7,
         "box_scale": 1.9,
         "pose_input": "location",
@@ -296,7 +296,8 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "nonrigid.nonrigid_until": 50_000 / 400_000,
         "nonrigid.nonrigid_lr": 5e-5,
     },
-    "deformable-splatting": {  # hustvl/4DGaussians, arguments/__init__.py and dnerf/dnerf_default.py
+    # hustvl/4DGaussians, 843d5ac: arguments/__init__.py, arguments/dnerf/dnerf_default.py and scene/deformation.py
+    "deformable-splatting": {
         "initial_gaussians": 2000,  # random ones, of D-NeRF's scenes
         "ssim_weight": 0.0,
         "motion.plane_resolution": 64,
@@ -313,6 +314,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "motion.planes_lr": 1.6e-3,
         "motion.motion_lr": 1.6e-4,
         "motion.final_rate": 0.01,
+        "motion.rigidity": 0.0,  # no such term; then no offset is bounded and no Gaussian stands still either
     },
     "block-nerf": {  # after the text of the appendix; codes, penalty and width also in hjxwhy/Block-NeRF
         "field": "network",
@@ -554,19 +556,19 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "filters.antialiased": False,
         "filters.filter_3d": False,
     },
-    "planar-splatting": {  # zju3dv/PGSR, arguments/__init__.py
+    "planar-splatting": {  # zju3dv/PGSR, de24f1a: arguments/__init__.py, train.py
         "planes.depth": "mean",
-        "planes.flatness_weight": 100.0,
         "planes.normal_weight": 0.015,
         "planes.photometric_weight": 0.15,
         "planes.geometric_weight": 0.03,
         "planes.consistency_from": 7000 / 30_000,
-        "planes.patches": 102_400,
-        "planes.patch_side": 7,
+        "planes.patches": 102_400,  # multi_view_sample_num
+        "planes.patch_side": 7,  # 2 * multi_view_patch_size + 1
         "planes.near_views": 8,
         "planes.view_angle": 30.0,
         "planes.both_views": True,
         "planes.discs": False,
+        "planes.flatness_weight": 100.0,  # scale_loss_weight
         "sh_degree": 3,
         "sh_degree_interval": 1000,
         "ssim_weight": 0.2,

@@ -64,8 +64,8 @@ class DeformableSplatting(CloudMethod):
         """A smaller cloud that begins dense, carried by nodes, coarser planes, and higher rates for few steps."""
         return changed(Config(tidying=ALL_RULES), initialization="dense", max_gaussians=40_000, cap_ramp=True,
             initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, most_haste=4.0, half_resolution_until=0.4,
-            plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08, planes_lr=4e-3,
-            motion_lr=1e-3, final_rate=0.1)  # fmt: skip
+            plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, rigidity=0.01, still_until=0.08,
+            planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -73,7 +73,8 @@ class DeformableSplatting(CloudMethod):
         return changed(
             Config(tidying=ALL_RULES), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1,
             initial_gaussians=200, ssim_weight=0.2, densify_grad_threshold=1e-6, opacity_reset_interval=5,
-            plane_resolution=4, plane_moments=4, plane_features=4, nodes=20, all_moments_from=0.3, still_until=0.0,
+            plane_resolution=4, plane_moments=4, plane_features=4, nodes=20, rigidity=0.01, all_moments_from=0.3,
+            still_until=0.0,
         )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:

@@ -252,8 +252,9 @@ class NSFF(FieldMethod):
             picture = composite(packed, there.density, there.rgb, background, weight=weight_so_far)
             certain = picture.extra["weight"][:, 0] + 1 - picture.opacity
             flow, (back, _) = self.toward(at.motion, way[ray])[0], self.toward(there.motion, 1 - way[ray])
-            values = {
-                "photometric": seen(known, certain * (picture.rgb - target).square().mean(-1)),
+            error = seen(known, certain * (picture.rgb - target).square().mean(-1))
+            values = {  # of both ways the mean weighted by certainty, as the release's; of one way the mean
+                "photometric": error / seen(known, certain).clamp_min(1e-6) if c.both_ways else error,
                 "occlusion": OCCLUSION_WEIGHT * seen(known[ray], 1 - weight[:, 0]),
                 "cycle": CYCLE_WEIGHT * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
             }
