@@ -61,6 +61,17 @@ class Config(BaseConfig):
     code_steps: Tally = 800  # steps that fit the code of a new shape, section 6.2; more take longer
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "facebookresearch/DeepSDF, examples/chairs/specs.json (48c19b8)": (
+        "depth hidden_width skip_layer weight_norm dropout code code_weight code_bound clamp_distance points_per_shape "
+        "learning_rate code_learning_rate"
+    ),
+    "facebookresearch/DeepSDF, networks/deep_sdf_decoder.py (48c19b8)": "octaves",
+    "facebookresearch/DeepSDF, train_deep_sdf.py (48c19b8)": "code_growth",
+    "facebookresearch/DeepSDF, reconstruct.py (48c19b8)": "fit_weight fit_learning_rate code_steps",
+    "facebookresearch/DeepSDF, src/PreprocessMesh.cpp (48c19b8)": "near_spread fine_spread",
+    "Park 2019, sections 4.2 and 5": "code_deviation pool_points",
+}
 FIRST_OUTPUT = 0.03  # deviation of the network's first outputs: beyond delta the clamped error has no gradient
 OBSERVED_POINTS = 1 << 14  # points of a new shape that its code is fitted to
 MAX_CANDIDATES, MAX_PLACED_CANDIDATES = 64, 16  # learnt codes at most that a fit may begin with; at each place

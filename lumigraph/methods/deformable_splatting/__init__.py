@@ -44,6 +44,19 @@ class Config(BaseConfig):
     tidying: TidyingNumbers = TidyingNumbers()
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "hustvl/4DGaussians, arguments/dnerf/dnerf_default.py (843d5ac)": (
+        "plane_scales motion_width still_until plane_smoothness time_smoothness time_sparsity planes_lr motion_lr "
+        "final_rate"
+    ),
+    "hustvl/4DGaussians, arguments/__init__.py (843d5ac)": (
+        "ssim_weight plane_resolution plane_moments plane_features"
+    ),
+    "hustvl/4DGaussians, scene/dataset_readers.py (843d5ac)": "initial_gaussians",
+    "hustvl/4DGaussians, scene/deformation.py (843d5ac), which has no such part": "nodes all_moments_from rigidity",
+}
+
+
 class DeformableSplatting(CloudMethod):
     """A canonical cloud, moved to the moment of a photograph before it is rasterized."""
 

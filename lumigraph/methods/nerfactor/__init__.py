@@ -96,6 +96,15 @@ class Config(BaseConfig):
     huber_delta: PositiveShare = 0.1  # residual of the geometry's loss at which it turns linear; 1: always squared
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google/nerfactor, nerfactor/config/nerfactor.ini (a668dca)": (
+        "properties visibility reflectance property_layers property_width position_frequencies direction_frequencies "
+        "light_rows surface_rays jitter normal_weight visibility_weight normal_smoothness visibility_smoothness "
+        "albedo_smoothness code_smoothness light_variation learning_rate final_learning_rate light_rate"
+    ),
+    "google/nerfactor, nerfactor/config/shape.ini (a668dca)": "shape_share shape_weight shape_learning_rate",
+    "google/nerfactor, nerfactor/config/brdf.ini (a668dca)": "angle_frequencies code_width",
+}
 MIN_ALBEDO, ALBEDO_RANGE = 0.03, 0.77  # section 3.3
 FIRST_LIGHT = 0.5  # radiance of the light at first, the middle of what the release draws
 DECAY_START = 0.3  # share of the geometry's stage before its rate falls

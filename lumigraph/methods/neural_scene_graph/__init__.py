@@ -58,6 +58,17 @@ class Config(BaseConfig):
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "princeton-computational-imaging/neural-scene-graphs, example_configs/config_kitti_0006_example_train.txt": (
+        "rays_per_step code_width code_weight box_samples box_scale learning_rate"
+    ),
+    "princeton-computational-imaging/neural-scene-graphs, main.py (8d3d9ce)": (
+        "field depth skip_layer position_frequencies direction_frequencies hidden_width pose_input symmetric "
+        "huber_delta"
+    ),
+}
+
+
 class NeuralSceneGraph(FieldMethod):
     """A background field, one field per class with a latent code per instance, and nodes: boxes with poses over time.
 

@@ -62,6 +62,18 @@ class Config(BaseConfig):
     static_field: bool = True  # a static field beside the dynamic one; off: the dynamic one shows everything
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "zhengqili/Neural-Scene-Flow-Fields, nsff_exp/configs/config_kid-running.txt (d400175)": (
+        "samples rays_per_step hidden_width neighbours cycle_weight smooth_weight flow_weight depth_weight "
+        "prior_interval"
+    ),
+    "zhengqili/Neural-Scene-Flow-Fields, nsff_exp/run_nerf.py (d400175)": (
+        "field depth position_frequencies direction_frequencies learning_rate static_field both_ways max_flow "
+        "occlusion_weight"
+    ),
+}
+
+
 class Hop(NamedTuple):
     """Samples of rays, warped to another time, with the dynamic field there.
 

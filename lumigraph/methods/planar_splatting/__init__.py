@@ -85,6 +85,20 @@ class Config(BaseConfig):
             raise LumigraphError(f"Patches of {self.planes.patch_side} pixels have no middle; give an odd --patch-side")
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "zju3dv/PGSR, arguments/__init__.py (de24f1a)": (
+        "flatness_weight normal_weight photometric_weight geometric_weight consistency_from patches patch_side "
+        "near_views view_angle sh_degree ssim_weight means_lr final_means_lr sh_lr opacities_lr scales_lr "
+        "quaternions_lr refine_every refine_from refine_until densify_grad_threshold opacity_reset_interval"
+    ),
+    "zju3dv/PGSR, train.py (de24f1a)": "edge_power depth both_views sh_degree_interval initialization",
+    "zju3dv/PGSR, train.py (de24f1a), which has no such step": (
+        "discs half_resolution_until most_haste max_gaussians cap_ramp prune_near limit_scale limit_anisotropy "
+        "observed_harmonics"
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Pair(Photograph):
     """A photograph and a neighbouring one.
