@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import statistics
@@ -17,12 +18,16 @@ import pytest
 from budgets import budget
 from PIL import Image
 
+from lumigraph import methods
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation.halves import LEFT_HALVES, RIGHT_HALVES
-from lumigraph.lab.benchmark.cell import FIGURES, Cell, CellSettings, published
+from lumigraph.lab.benchmark import published as published_table
+from lumigraph.lab.benchmark.cell import Cell, CellSettings, ScenePSNR, published
 from lumigraph.lab.benchmark.conduct import Patience, conduct, draw_charts, launch, reason
+from lumigraph.lab.benchmark.published import RESULTS, first_of
+from lumigraph.lab.benchmark.table import few_view_results
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 40)
@@ -247,10 +252,42 @@ def test_time_left_counts_what_is_not_training():
 
 
 def test_published_figures_are_of_methods_and_scenes():
-    assert published("nerf", "Lego") == FIGURES["nerf", "lego"] and published("nerf", "my-garden") is None
-    assert all(
-        10 < figure.psnr < 50 and "x" in figure.resolution and "20" in figure.source for figure in FIGURES.values()
+    assert published("nerf", "Lego") == ScenePSNR(32.54, "800x800", "Mildenhall et al. 2020, white background")
+    assert published("nerf", "fern") == ScenePSNR(25.17, "1008x756", "Mildenhall et al. 2020")
+    assert published("nerf", "my-garden") is None
+
+
+def test_each_published_result_has_an_owner_a_protocol_and_a_source():
+    for result in RESULTS:
+        assert result.method in methods.available() and result.data and result.protocol, result
+        assert re.fullmatch(r"[^\W\d].+ (19|20)\d\d", result.measured_by), result
+        assert re.fullmatch(r"arXiv \d{4}\.\d{4,5}", result.source), result
+        assert re.search(r"\d", result.value) and float(re.findall(r"[\d.]+", result.value)[0]) > 0, result
+    places = [(x.method, x.metric, x.data, x.protocol) for x in RESULTS]
+    assert len({*places}) == len(places), "one result stands twice"
+
+
+def test_published_results_of_others_name_them():
+    """Park 2021 and Li 2021 did not measure these captures, nor did Weng 2022 these of people."""
+    owners = {name: first_of(name).measured_by for name in ("nerfies", "nsff", "humannerf", "mip-nerf", "nerf")}
+    assert owners == {
+        "nerfies": "Gao et al. 2022",
+        "nsff": "Gao et al. 2022",
+        "humannerf": "Hu et al. 2024",
+        "mip-nerf": "Barron et al. 2021",
+        "nerf": "Mildenhall et al. 2020",
+    }
+    assert first_of("regnerf").sentence == (
+        "18.89 dB: DTU, 15 scenes, 3 photographs, background masked out (measured by Niemeyer et al. 2022)"
     )
+    assert first_of("eg3d").sentence.startswith("FID 4.70: FFHQ") and first_of("srn") is None
+
+
+def test_documents_have_the_table_of_published_results():
+    assert few_view_results() in (Path(__file__).parent.parent / "docs" / "few-views.md").read_text("utf-8")
+    own = re.compile(r"class Published|PSNR, dB\"|arXiv \d{4}\.\d{5}")
+    folder = Path(published_table.__file__).parent
+    assert [x.name for x in folder.glob("*.py") if own.search(x.read_text("utf-8"))] == ["published.py"]
 
 
 def test_a_process_says_why_it_failed(tmp_path):

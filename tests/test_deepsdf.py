@@ -18,6 +18,7 @@ from lumigraph.components.training.shape_points import PointNumbers, sampled
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.shapes import PointBatch, Shape, Shapes, normalised
 from lumigraph.errors import LumigraphError
+from lumigraph.files.ranges import changed
 from lumigraph.methods.deepsdf import Config, DeepSDF
 from lumigraph.metrics import intersection_over_union
 from lumigraph.opening import open_dataset
@@ -77,9 +78,32 @@ def test_the_error_is_that_of_clamped_distances(monkeypatch):
     batch = PointBatch(
         torch.zeros(3, 3), torch.zeros(3, dtype=torch.long), torch.tensor([0.05, 0.3, 0.02]), torch.zeros(3)
     )
+    method.progress = 1.0
     terms = method.loss(batch, 0)
     assert float(terms["distance"]) == pytest.approx((0.02 + 0 + 0.12) / 3)
-    assert float(terms["code"].detach()) == pytest.approx(1e-4 * float(method.codes.rows[0].detach().square().sum()))
+    assert float(terms["code"].detach()) == pytest.approx(1e-4 * float(method.codes.rows[0].detach().norm()))
+    method.progress = 50 / 2001  # the weight grows over 100 of 2001 epochs
+    assert float(method.loss(batch, 0)["code"].detach()) == pytest.approx(float(terms["code"].detach()) / 2)
+
+
+def test_codes_are_not_longer_than_one():
+    method = DeepSDF(tiny_shapes.shapes().frame, DeepSDF.smallest())
+    method.begin(tiny_shapes.shapes())
+    with torch.no_grad():
+        method.codes.rows[1] = torch.tensor([3.0, 4.0, 0.0, 0.0])
+    short = method.codes.rows[0].detach().clone()
+    method.after_step(0)
+    torch.testing.assert_close(method.codes.rows[1].detach(), torch.tensor([0.6, 0.8, 0.0, 0.0]))
+    assert torch.equal(method.codes.rows[0], short)
+
+
+def test_half_of_a_step_is_inside():
+    """Also of a thin plate, of whose sampled points far fewer are."""
+    plate = normalised("plate", tiny_shapes.made(trimesh.creation.box((1.0, 1.0, 0.02))))
+    method = DeepSDF(plate.frame, changed(DeepSDF.smallest(), pool_points=4096, points_per_shape=1000))
+    batch = method.batch(single(plate), torch.Generator().manual_seed(0))
+    assert int((batch.occupancy > 0).sum()) == 500
+    assert float((method.pools.pools[0].occupancy > 0).float().mean()) < 0.4
 
 
 def test_dropout_follows_the_step_alone_and_ends_with_it():

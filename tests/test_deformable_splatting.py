@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
 from budgets import budget
 
+from lumigraph.components.clouds.addition import Step
 from lumigraph.geometry import multiply, rotated
 from lumigraph.methods.deformable_splatting import DeformableSplatting
 from lumigraph.methods.deformable_splatting.planes import PAIRS, PLANE_SCALES, PlaneMotion, SpaceTimePlanes, spread
@@ -174,3 +176,21 @@ def test_points_are_followed_with_the_gaussians_around_them():
     expected = rotated(points, angle.expand(20, 3)) + 0.2
     torch.testing.assert_close(method.follow(points, 1.0, 3.0), expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(method.follow(expected, 3.0, 1.0), points, atol=1e-4, rtol=0)
+
+
+def test_without_rigidity_the_motion_is_the_releases():
+    """A head for each output, offsets without a bound, and nothing told apart."""
+    numbers = replace(DeformableSplatting.smallest().motion, rigidity=0.0, nodes=0)
+    motion, points = PlaneMotion(FRAME, numbers, 20), torch.zeros(20, 3)
+    for head, value in zip(motion.heads, (100.0, 0.0, 2.0), strict=True):
+        head[-1].weight.data.zero_()
+        head[-1].bias.data.fill_(value)
+    offset, turn, size = motion.offsets(points, 2.0)
+    assert (offset == 100).all() and (size == 2).all()
+    assert torch.equal(turn, torch.tensor([[1.0, 0, 0, 0]]).expand(20, 4))
+    step = object.__new__(Step)
+    step.due, step.progress, step.learnt = True, 0.9, SimpleNamespace(means=points)
+    motion.heads[0][-1].bias.data.zero_()  # nothing moves now, and all may still move
+    motion.active.fill_(True)
+    motion.finish(step)
+    assert motion.moves.all()

@@ -11,6 +11,7 @@ from test_benchmark import Here
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.lab.benchmark import gallery as room
+from lumigraph.lab.benchmark.published import Published
 
 pytestmark = budget("runs", 4)
 
@@ -21,13 +22,16 @@ def test_every_method_has_a_place():
 
 
 def test_a_page_has_picture_idea_and_figures(ball_folder, tmp_path, monkeypatch):
-    piece = room.Showpiece(str(ball_folder), "Voxels & colours.", "99 dB, nowhere")
+    piece = room.Showpiece(str(ball_folder), "Voxels & colours.")
+    known = Published("voxel-grid", "99", "PSNR, dB", "no scene", "no pixels", "Nobody 1999", "nowhere")
+    monkeypatch.setattr(room, "first_of", {"voxel-grid": known}.get)
     monkeypatch.setattr(room, "SECTIONS", {"Grids": {"voxel-grid": piece}})
     monkeypatch.setattr(room, "SHOWPIECES", {"voxel-grid": piece})
     here = Here()
     assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=here) == 0
     page = (tmp_path / "out" / "gallery.html").read_text()
-    for part in ("<h2>Grids</h2>", "Voxels &amp; colours.", "PSNR", "published: 99 dB, nowhere", "data:image/jpeg"):
+    owner = "published, of other data: 99 dB: no scene, no pixels (measured by Nobody 1999)"
+    for part in ("<h2>Grids</h2>", "Voxels &amp; colours.", "PSNR", owner, "data:image/jpeg"):
         assert part in page, part
     again = Here()
     assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=again) == 0 and again.seen == []

@@ -197,6 +197,12 @@ def test_networks_of_the_paper_learn(monkeypatch):
     method.surface = lambda rays: (0.6 * unit(rays.at(torch.full((len(rays),), 2.4))), torch.ones(len(rays)))  # type: ignore[method-assign]
     terms = method.loss(batch, 0)
     assert set(terms) >= {"colour", "normals", "visibility", "albedo_smoothness", "code_smoothness", "light_variation"}
+    method.config = replace(method.config, shape_share=0.5)  # until then, shape.ini of the release
+    method.progress = 0.4
+    alone = method.loss(batch, 0)
+    assert "colour" not in alone and method.learning_rate(0, 0.4)["properties"] == 1e-2
+    for name in ("normals", "visibility"):  # 1 and 0.1
+        assert float(alone[name].detach()) == pytest.approx(10 * float(terms[name].detach()))
     sum(terms.values()).backward()
     learns = {name: p for name, p in method.named_parameters() if p.requires_grad}
     assert {name.split(".")[0] for name in learns} == {"properties", "lights_seen", "log_light"}

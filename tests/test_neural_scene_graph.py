@@ -28,7 +28,7 @@ from lumigraph.geometry import Similarity, rotated, to_matrix
 from lumigraph.large import open_any
 from lumigraph.method.field_method import FieldMethod
 from lumigraph.methods import neural_scene_graph
-from lumigraph.methods.neural_scene_graph import NeuralSceneGraph, found_in
+from lumigraph.methods.neural_scene_graph import NeuralSceneGraph, found_in, prior_of
 from lumigraph.methods.neural_scene_graph.nodes import PoseTable, crossings, exponential
 from lumigraph.opening import open_scene, read_capture
 from lumigraph.readers.tracks import read_tracks, write_tracks
@@ -412,3 +412,11 @@ def test_tracks_follow_a_change_of_frame():
     assert moved.size == pytest.approx((8.0, 4.0, 2.0))
     np.testing.assert_allclose(moved.positions[1], (1.0, 16.0, 1.0), atol=1e-9)
     np.testing.assert_allclose(moved.pose(1.0)[:, 0], (0, 1, 0), atol=1e-6)
+
+
+def test_the_prior_of_codes_is_the_releases():
+    """latentReg: 1e-4 times the sum of norms, 5 and 13; the mean square with tables is ours."""
+    codes = torch.tensor([[3.0, 4.0], [5.0, 12.0]])
+    assert float(prior_of(codes, NeuralSceneGraph.Config())) == pytest.approx(1e-4 * (5 + 13))
+    small = NeuralSceneGraph.cpu_preset()
+    assert float(prior_of(codes, small)) == pytest.approx(1e-3 * (9 + 16 + 25 + 144) / 4)

@@ -1,8 +1,9 @@
 """The numbers of `--preset paper`, held as literals, the page's section on where a method differs from its paper, and
-its table of options. `python tests/test_paper_presets.py` writes these tables.
+its tables of options and of sources. `python tests/test_paper_presets.py` writes these tables.
 
-A source is the authors' release, by repository and file, or the paper. "After the text" marks numbers that no release
-of the authors confirms.
+PUBLISHED holds what was copied by hand from a source, `SOURCES` beside a Config names the source of each of its
+numbers. A source is the authors' release, by repository and file, or the paper. "After the text" marks numbers that no
+release of the authors confirms.
 """
 
 from __future__ import annotations
@@ -29,6 +30,13 @@ PAGES = Path(__file__).parent.parent / "docs" / "methods"
 FILES = {path.stem for path in Path(methods.__file__).parent.iterdir()}
 SHARED_PAGE = PAGES.parent / "training.md"  # options of parts that several methods have
 TABLE = re.compile(r"(?<=<!-- options -->\n).*?(?=<!-- end of options -->)", re.DOTALL)
+SOURCES = re.compile(r"(?<=<!-- sources -->\n).*?(?=<!-- end of sources -->)", re.DOTALL)
+IS_SOURCE = re.compile(r"[\w.-]+/[\w.-]+, \S+|.+ \d{4}, ")  # a release and its file, or authors, year and the place
+WITHOUT_SOURCES = (  # may only get shorter: a comment in PUBLISHED names sources of all of their numbers together
+    "object-nerf", "dream-fields", "dream-splats", "splat-slam", "nerf-w", "nerfies", "neural-volumes", "block-nerf",
+    "regnerf", "instant-ngp", "neus", "plenoxels", "plenoctrees", "snerg", "tensorf", "pixelnerf", "deep-appearance",
+    "voxel-fit", "eg3d", "srn", "gancraft", "dvr", "occupancy-network",
+)  # fmt: skip
 NAMES = [name for name in methods.available() if name.replace("-", "_") in FILES]  # tiny adds some of the tests' own
 
 WORDS: dict[str, Any] = {
@@ -98,7 +106,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "rates.scales_lr": 5e-3,
         "rates.quaternions_lr": 5e-3,
     },
-    "imap": {  # after the text of sections 3.1 to 3.4, which has no release; rates and iterations are ours
+    "imap": {  # after the text of sections 3.1 to 3.4 and 4, which has no release; iterations are ours
         "field": "network",
         "layers": 4,
         "hidden_width": 256,
@@ -115,6 +123,8 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "terms.colour_weight": 5.0,
         "terms.depth_weight": 1.0,
         "terms.distance_weight": 0.0,
+        "learning_rate": 1e-3,  # section 4, of the map
+        "mapping.keyframe_pose_rate": 3e-3,  # section 4, of poses
     },
     "splat-slam": {  # spla-tam/SplaTAM, configs/replica/splatam.py; the paper's sections 3.2 to 3.4
         "tracking.first_estimate": "velocity",
@@ -178,7 +188,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hidden_width": 256,
         "rays.rays_per_step": 8192,
         "code_width": 256,
-        "code_weight": 1e-4,  # latent_balance
+        "code_weight": 1e-4,  # latent_balance, of the sum of norms: neural_scene_graph_helper.py, latentReg
         "box_samples": 7,
         "box_scale": 1.9,
         "pose_input": "location",
@@ -244,7 +254,6 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "flow.occlusion_weight": 0.1,
         "flow.cycle_weight": 1.0,
         "flow.smooth_weight": 0.1,
-        "flow.min_weight": 0.01,
         "flow.flow_weight": 0.02,
         "flow.depth_weight": 0.04,
         "flow.prior_interval": 30_000 / 500_000,
@@ -275,7 +284,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "adaptive.densify_grad_threshold": 2e-4,
         "refine.refine_every": 100,
     },
-    "humannerf": {  # chungyiweng/humannerf, configs/default.yaml; 400 000 steps
+    "humannerf": {  # chungyiweng/humannerf, 7389c40: configs/default.yaml; 400 000 steps
         "hidden_width": 256,
         "network.depth": 8,
         "network.position_frequencies": 10,
@@ -296,7 +305,8 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "nonrigid.nonrigid_until": 50_000 / 400_000,
         "nonrigid.nonrigid_lr": 5e-5,
     },
-    "deformable-splatting": {  # hustvl/4DGaussians, arguments/__init__.py and dnerf/dnerf_default.py
+    # hustvl/4DGaussians, 843d5ac: arguments/__init__.py, arguments/dnerf/dnerf_default.py and scene/deformation.py
+    "deformable-splatting": {
         "initial_gaussians": 2000,  # random ones, of D-NeRF's scenes
         "ssim_weight": 0.0,
         "motion.plane_resolution": 64,
@@ -313,6 +323,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "motion.planes_lr": 1.6e-3,
         "motion.motion_lr": 1.6e-4,
         "motion.final_rate": 0.01,
+        "motion.rigidity": 0.0,  # no such term; then no offset is bounded and no Gaussian stands still either
     },
     "block-nerf": {  # after the text of the appendix; codes, penalty and width also in hjxwhy/Block-NeRF
         "field": "network",
@@ -364,27 +375,32 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "huber_delta": 0.0,  # squared
         "exposure_scales": True,
     },
-    "nerfactor": {  # google/nerfactor, nerfactor/config/nerfactor.ini, shape.ini and brdf.ini
+    "nerfactor": {  # google/nerfactor, a668dca: nerfactor/config/nerfactor.ini, shape.ini and brdf.ini
         "properties": "network",
         "visibility": "network",
         "reflectance": "learnt",
-        "property_layers": 4,
-        "property_width": 128,
-        "position_frequencies": 10,
-        "direction_frequencies": 4,
-        "angle_frequencies": 2,
-        "code_width": 3,
+        "property_layers": 4,  # mlp_depth
+        "property_width": 128,  # mlp_width
+        "position_frequencies": 10,  # n_freqs_xyz
+        "direction_frequencies": 4,  # n_freqs_ldir
+        "angle_frequencies": 2,  # brdf.ini, n_freqs
+        "code_width": 3,  # brdf.ini, z_dim
         "light_rows": 16,
         "surface_rays": 1024,
         "jitter": 0.01,
+        "shape_share": pytest.approx(200 / (200 + 100)),  # epochs of shape.ini and of nerfactor.ini
+        "shape_weight": 1.0,  # shape.ini, normal_loss_weight and lvis_loss_weight
+        "shape_learning_rate": 1e-2,  # shape.ini
         "normal_weight": 0.1,
         "visibility_weight": 0.1,
-        "normal_smoothness": 0.01,
-        "visibility_smoothness": 0.01,
-        "albedo_smoothness": 0.01,
+        "normal_smoothness": 0.05,
+        "visibility_smoothness": 0.05,
+        "albedo_smoothness": 0.05,
         "code_smoothness": 0.01,
         "light_variation": 5e-6,
-        "learning_rate": 1e-3,
+        "learning_rate": 5e-3,
+        "final_learning_rate": pytest.approx(4.775e-3, rel=1e-4),  # 0.1 in 500 000 steps, of which 10 000 are taken
+        "light_rate": 5e-3,
     },
     "instant-ngp": {  # the paper's table 1, sections 4 and 5.4; NVlabs/instant-ngp, configs/nerf/base.json
         "table.levels": 16,
@@ -549,19 +565,20 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "filters.antialiased": False,
         "filters.filter_3d": False,
     },
-    "planar-splatting": {  # zju3dv/PGSR, arguments/__init__.py
+    "planar-splatting": {  # zju3dv/PGSR, de24f1a: arguments/__init__.py, train.py
         "planes.depth": "mean",
-        "planes.flatness_weight": 100.0,
         "planes.normal_weight": 0.015,
         "planes.photometric_weight": 0.15,
         "planes.geometric_weight": 0.03,
         "planes.consistency_from": 7000 / 30_000,
-        "planes.patches": 102_400,
-        "planes.patch_side": 7,
+        "planes.patches": 102_400,  # multi_view_sample_num
+        "planes.patch_side": 7,  # 2 * multi_view_patch_size + 1
         "planes.near_views": 8,
         "planes.view_angle": 30.0,
         "planes.both_views": True,
         "planes.discs": False,
+        "edge_power": 2,  # train.py: image_weight.clamp(0, 1) ** 2
+        "planes.flatness_weight": 100.0,  # scale_loss_weight
         "sh_degree": 3,
         "sh_degree_interval": 1000,
         "ssim_weight": 0.2,
@@ -628,7 +645,10 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "voxel_size": 0.004,
         "truncation": 5.0,  # 0.02 m
         "truncation_growth": 0.01,
-        "max_weight": 255.0,
+        "max_weight": 255.0,  # s_WeightMax
+        "sample_weight": 3.0,  # s_WeightSample, times 1.5 in the shader
+        "sensor_span": (0.4, 4.0),  # s_SensorDepthWorldMin and Max
+        "weighting": "depth",
         "max_depth": 3.0,
     },
     "voxel-fit": {  # no paper's; voxels, opacity and step of sunset1995/DirectVoxGO, configs/default.py
@@ -648,7 +668,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hyper_layers": 2,
         "hidden_width": 64,
     },
-    "deepsdf": {  # facebookresearch/DeepSDF, examples/chairs/specs.json
+    "deepsdf": {  # facebookresearch/DeepSDF, 48c19b8: examples/chairs/specs.json, train_deep_sdf.py, reconstruct.py
         "depth": 8,
         "hidden_width": 512,
         "skip_layer": 4,
@@ -657,9 +677,13 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "dropout": 0.2,
         "code": 256,
         "code_deviation": 0.01,  # section 4.2
-        "code_weight": 1e-4,
+        "code_weight": 1e-4,  # CodeRegularizationLambda
+        "code_growth": pytest.approx(100 / 2001),  # min(1, epoch / 100), of NumEpochs
+        "code_bound": 1.0,  # CodeBound
+        "fit_weight": 1e-4,  # of torch.mean(latent.pow(2))
+        "fit_learning_rate": 5e-3,
+        "code_steps": 800,
         "clamp_distance": 0.1,
-        "shapes_per_step": 8,
         "points_per_shape": 16_384,
         "points.pool_points": 500_000,  # section 5
         "points.near_spread": 0.05,  # src/PreprocessMesh.cpp: variances of 0.0025 and 0.00025
@@ -821,6 +845,43 @@ def number_of(config: Any, path: str) -> Any:
     return next(module[name.upper()] for module in modules if name.upper() in module)
 
 
+def sources_of(name: str) -> dict[str, list[str]]:
+    """Names of the numbers of each source, as the method's file has them."""
+    held = vars(sys.modules[methods.find(name).__module__]).get("SOURCES", {})
+    return {source: names.split() for source, names in held.items()}
+
+
+def test_methods_without_sources_only_become_fewer():
+    assert [name for name in NAMES if not sources_of(name)] == [name for name in NAMES if name in WITHOUT_SOURCES]
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in WITHOUT_SOURCES])
+def test_each_published_number_has_one_source(name):
+    said = [each for names in sources_of(name).values() for each in names]
+    assert sorted(said) == sorted(path.split(".")[-1] for path in PUBLISHED[name])
+    assert [source for source in sources_of(name) if not IS_SOURCE.match(source)] == []
+
+
+def sources_shown(name: str) -> str:
+    """Table of a method's sources with their numbers in the preset `paper`, and of its own numbers without one."""
+    config, paths = methods.find(name).Config(), {path.split(".")[-1]: path for path in PUBLISHED[name]}
+    rows = [
+        (source, [f"`{each}` {value_shown(number_of(config, paths[each]))}" for each in names])
+        for source, names in sources_of(name).items()
+    ]
+    own = [each.name for group in groups_of(config) if not is_shared(group) for each in fields(group)]
+    ours = [each for each in own if each not in paths and each != "seed" and not is_dataclass(value_of(config, each))]
+    rows += [("reference: no source, ours", [f"`{each}` {value_shown(value_of(config, each))}" for each in ours])]
+    table = [f"| {source} | {', '.join(numbers)} |" for source, numbers in rows if numbers]
+    return "\n".join(["| source | numbers of `--preset paper` |", "|---|---|", *table]) + "\n"
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in WITHOUT_SOURCES])
+def test_its_page_names_the_sources(name):
+    written = SOURCES.search(page_of(name).read_text("utf-8"))
+    assert written and written[0] == sources_shown(name), f"{name} is stale; run `python tests/test_paper_presets.py`"
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_preset_paper_says_its_memory(name):
     """Training asks for it first: a number of the paper's parts that it misses would end every run."""
@@ -898,3 +959,5 @@ def test_every_option_has_a_sentence_in_a_page(page):
 if __name__ == "__main__":
     for page, table in TABLES.items():
         page.write_text(TABLE.sub(lambda _, table=table: table(), page.read_text("utf-8")), "utf-8")
+    for page, name in {page_of(name): name for name in NAMES if sources_of(name)}.items():
+        page.write_text(SOURCES.sub(lambda _, name=name: sources_shown(name), page.read_text("utf-8")), "utf-8")

@@ -118,6 +118,12 @@ def test_normals_that_leave_the_depth_cost_but_not_at_edges():
     smooth = replace(seen, maps=tilted, grey=torch.full((SIZE, SIZE), 0.5))
     error = float(single_view_error(smooth))
     assert error == pytest.approx(float((tilted.normals[0, 0] - NORMAL).abs().sum()), rel=0.1)
+    ramp = replace(smooth, grey=torch.cat([torch.zeros(SIZE, SIZE // 2), torch.ones(SIZE, SIZE // 2) / 2], 1))
+    ramp.grey[:, -8:] += torch.arange(8) / 8  # an edge of 0.5 counts for all, the slope of 1/4 for a quarter
+    halves = float(single_view_error(ramp)) / error, float(single_view_error(ramp, 5)) / error
+    flat, slope = (SIZE - 2 - 2 - 7) / (SIZE - 2), 7 / (SIZE - 2)
+    assert halves[0] == pytest.approx(flat + slope * 0.5**2, abs=0.03)
+    assert halves[1] == pytest.approx(flat + slope * 0.5**5, abs=0.03)
     checked = replace(smooth, grey=torch.arange(SIZE).expand(SIZE, SIZE) % 4 / 4)  # edges everywhere
     assert float(single_view_error(checked)) < 0.4 * error
 

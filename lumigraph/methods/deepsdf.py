@@ -31,9 +31,11 @@ Tally = Annotated[int, between(0, 100_000)]
 
 FINAL_SHARE = 1 / 16  # share of both learning rates at the end of the budget
 FIT_LEARNING_RATE = 5e-3  # Adam's learning rate of a new code
-FIT_WEIGHT = 1e-4  # weight of the new code's squared length, eq. 10
+FIT_WEIGHT = 1e-4  # weight of the new code's mean square, eq. 10; as reconstruct.py has it
 CODE_DEVIATION = 0.01  # standard deviation of codes at first, section 4.2
-CODE_WEIGHT = 1e-4  # weight of the codes' squared lengths, eq. 9; higher keeps codes near zero
+CODE_WEIGHT = 1e-4  # weight of the codes' lengths, not squared as in eq. 9; higher keeps codes near zero
+CODE_GROWTH = 100 / 2001  # share of the budget in which this weight grows from zero: epochs of the published code
+CODE_BOUND = 1.0  # length of a code at most
 CLAMP_DISTANCE = 0.1  # delta of eq. 4, scene units; smaller concentrates on the surface
 OFFSET = 0.01  # scene units from a scanned point along its normal, at which the distance is known
 
@@ -59,6 +61,17 @@ class Config(BaseConfig):
     code_steps: Tally = 800  # steps that fit the code of a new shape, section 6.2; more take longer
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "facebookresearch/DeepSDF, examples/chairs/specs.json (48c19b8)": (
+        "depth hidden_width skip_layer weight_norm dropout code code_weight code_bound clamp_distance points_per_shape "
+        "learning_rate code_learning_rate"
+    ),
+    "facebookresearch/DeepSDF, networks/deep_sdf_decoder.py (48c19b8)": "octaves",
+    "facebookresearch/DeepSDF, train_deep_sdf.py (48c19b8)": "code_growth",
+    "facebookresearch/DeepSDF, reconstruct.py (48c19b8)": "fit_weight fit_learning_rate code_steps",
+    "facebookresearch/DeepSDF, src/PreprocessMesh.cpp (48c19b8)": "near_spread fine_spread",
+    "Park 2019, sections 4.2 and 5": "code_deviation pool_points",
+}
 FIRST_OUTPUT = 0.03  # deviation of the network's first outputs: beyond delta the clamped error has no gradient
 OBSERVED_POINTS = 1 << 14  # points of a new shape that its code is fitted to
 MAX_CANDIDATES, MAX_PLACED_CANDIDATES = 64, 16  # learnt codes at most that a fit may begin with; at each place
@@ -150,16 +163,24 @@ class DeepSDF(CodedSurface):
 
     def batch(self, data: Shapes, generator: torch.Generator) -> PointBatch:  # type: ignore[override]
         c = self.config
-        return self.pools.lesson(data, c.shapes_per_step, c.points_per_shape, generator).to(self.device)
+        return self.pools.lesson(data, c.shapes_per_step, c.points_per_shape, generator, balanced=True).to(self.device)
 
     def loss(self, batch: PointBatch, step: int) -> dict[str, Tensor]:  # type: ignore[override]
-        """The error of clamped distances (eq. 4), and the prior of codes (eq. 9)."""
+        """The error of clamped distances (eq. 4), and the prior of codes (eq. 9, as train_deep_sdf.py weights it)."""
         codes = self.codes(batch.member)
         self.decoder.drop_by(self.random(step))
         error = self._error(codes, batch.points, batch.signed)
         self.decoder.drop_by(None)
         self.figures = {"distance error": float(error.detach())}
-        return {"distance": error, "code": CODE_WEIGHT * codes.square().sum(-1).mean()}
+        return {
+            "distance": error,
+            "code": min(1.0, self.progress / CODE_GROWTH) * CODE_WEIGHT * codes.norm(dim=-1).mean(),
+        }
+
+    @torch.no_grad()
+    def after_step(self, step: int) -> None:
+        super().after_step(step)
+        self.codes.rows.renorm_(2, 0, CODE_BOUND)
 
     def _error(
         self, codes: Float[Tensor, "point code"], points: Float[Tensor, "point 3"], distance: Float[Tensor, " point"]
@@ -221,7 +242,7 @@ class DeepSDF(CodedSurface):
             some = torch.randint(len(points), (count,), generator=generator).to(self.device)
             moved = scale * points[some] + shift
             off = self._error(code.expand(count, -1), moved, scale * distance[some])
-            return off / scale + FIT_WEIGHT * code.square().sum()  # in units of the scan, or it would shrink
+            return off / scale + FIT_WEIGHT * code.square().mean()  # in units of the scan, or it would shrink
 
         with torch.no_grad():
             start = self._start(shape, partial(error, count=256))

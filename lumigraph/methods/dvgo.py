@@ -76,6 +76,14 @@ class Config(BaseConfig):
     entropy_weight: NonNegative = 0.001  # the same in the fine stage; higher gives harder edges
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "sunset1995/DirectVoxGO, configs/default.py": (
+        "coarse_voxels voxels feature_channels hidden_width hidden_layers coarse_alpha fine_alpha doublings "
+        "growing_share box_alpha step_size weight_threshold density_learning_rate feature_learning_rate "
+        "network_learning_rate coarse_point_weight point_weight coarse_entropy_weight entropy_weight"
+    ),
+    "Sun 2022, section 6.1": "coarse_share",
+}
 EMPTY = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001
 TEACHER_EMPTY = -3.0  # of density, where another method that is taken over holds nothing; it can still learn
 FREE_FROM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike

@@ -36,6 +36,14 @@ class Config(BaseConfig):
     exact: bool = False  # multiply in float32 even where bfloat16 is faster; slower and more precise
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "tancik/fourier-feature-networks, 2d_image_regression.ipynb": (
+        "encoding frequencies layers hidden_width learning_rate"
+    ),
+    "tancik/fourier-feature-networks, Demo.ipynb": "scale",
+}
+
+
 class FourierFeatures(RayMethod):
     """The wall y = 0, painted: gamma encodes a place on it, and a network gives the colour there.
 

@@ -45,6 +45,11 @@ class Config(BaseConfig):
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Gortler 1996, section 3.4": "blended_views",
+}
+
+
 class Lumigraph(ImageBasedMethod):
     """Photographs, a depth map of each, and weights by angle, resolution and field of view."""
 

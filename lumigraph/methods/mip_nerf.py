@@ -40,6 +40,15 @@ class Config(BaseConfig):
     warmup: Share = 0.0025  # share of the budget in which the learning rate rises, section 4; 0: none
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google/mipnerf, internal/models.py": (
+        "depth position_frequencies direction_frequencies hidden_width coarse_samples fine_samples resample_padding"
+    ),
+    "google/mipnerf, internal/utils.py": "rays_per_step coarse_loss_weight learning_rate final_learning_rate warmup",
+    "google/mipnerf, internal/models.py, which has no such step": "occupancy_resolution",
+}
+
+
 class MipNeRF(FieldMethod):
     """One network, evaluated twice on frustums of cones: evenly at first, then where density was found."""
 

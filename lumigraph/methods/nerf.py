@@ -52,6 +52,17 @@ class Config(BaseConfig):
             )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "bmild/nerf, run_nerf.py": (
+        "depth skip_layer position_frequencies direction_frequencies hidden_width networks coarse_loss_weight"
+    ),
+    "bmild/nerf, paper_configs/blender_config.txt": "coarse_samples fine_samples learning_rate final_learning_rate",
+    "bmild/nerf, paper_configs/llff_config.txt": "density_noise",
+    "Mildenhall 2020, section 5.3": "rays_per_step",
+    "bmild/nerf, run_nerf.py, which has no such step": "occupancy_resolution transmittance_threshold",
+}
+
+
 class NeRF(FieldMethod):
     """Coarse samples evenly along each ray, fine ones where the coarse ones found density (section 5.2)."""
 

@@ -55,6 +55,9 @@ class Config(BaseConfig):
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google-research/multinerf, internal/train_utils.py": "epsilon huber_delta exposure_scales",
+}
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen
 DEFAULT_APERTURE = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture
 MAX_APERTURE, MAX_FOCUS = 0.5, 8.0  # aperture in scene units; focus in reaches

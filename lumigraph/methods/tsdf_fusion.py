@@ -48,6 +48,12 @@ class Config(BaseConfig):
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "niessner/VoxelHashing, DepthSensing/zParametersDefault.txt (421d548)": (
+        "voxel_size truncation truncation_growth max_weight max_depth sample_weight sensor_span"
+    ),
+    "niessner/VoxelHashing, DepthSensing/Shaders/SceneRepSDF.hlsl (421d548)": "weighting",
+}
 BY_ANGLE = Config(truncation=4.0, truncation_growth=0.0, weighting="angle", max_depth=0.0)  # for any unit and range
 
 

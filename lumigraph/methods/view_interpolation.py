@@ -42,6 +42,11 @@ class Config(BaseConfig):
     warped_views: Annotated[int, between(1, 16)] = 2  # photographs warped into a picture; more: fewer holes, slower
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Chen and Williams 1993, between two photographs": "warped_views",
+}
+
+
 class ViewInterpolation(ImageBasedMethod):
     """Photographs with depth, or flow between neighbours; a picture blends the nearest ones."""
 

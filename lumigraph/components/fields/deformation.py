@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -24,11 +25,11 @@ def window(bands: int, alpha: Tensor) -> Float[Tensor, " band"]:
 
 class DeformationNetwork(SkipNetwork):
     """Numbers at a point and a code: hidden layers over the encoded point and the code, and a last one initialised
-    close to zero."""
+    close to zero. All in float32: bfloat16 would quantise motions and poses."""
 
     def __init__(self, bands: int, code: int, depth: int, width: int, skip_layer: int, outputs: int):
         encoding = FrequencyEncoding(3, bands)
-        super().__init__(encoding.width + code, depth, width, skip_layer, Dense)
+        super().__init__(encoding.width + code, depth, width, skip_layer, partial(Dense, exact=True))
         self.encoding, self.last = encoding, Dense(width, outputs, exact=True)
         nn.init.uniform_(self.last.weight, -FIRST_MOTION, FIRST_MOTION)
 

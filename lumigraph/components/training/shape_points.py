@@ -35,19 +35,29 @@ class PointPools:
         self.learner, self.numbers, self.seed = learner, numbers, seed
         self.pools: dict[int, PointBatch] = {}
 
-    def draw(self, shapes: Shapes, member: int, count: int, generator: torch.Generator) -> PointBatch:
-        """Random points of a member's pool. Raises LumigraphError for a member without an inside."""
+    def draw(
+        self, shapes: Shapes, member: int, count: int, generator: torch.Generator, balanced: bool = False
+    ) -> PointBatch:
+        """Random points of a member's pool; `balanced`: half of them inside. Raises LumigraphError for a member without
+        an inside."""
         if member not in self.pools:
             own = torch.Generator().manual_seed(self.seed + MEMBER_SEEDS * (member + 1))
             self.pools[member] = sampled(shapes.members[member], self.numbers, self.learner, own, member)
         pool = self.pools[member]
-        return pool[torch.randint(len(pool), (count,), generator=generator)]
+        if not balanced:
+            return pool[torch.randint(len(pool), (count,), generator=generator)]
+        assert isinstance(pool.occupancy, Tensor)
+        sides = [side.nonzero()[:, 0] for side in (pool.occupancy > 0, pool.occupancy == 0) if side.any()]
+        rows = [side[torch.randint(len(side), (-(-count // len(sides)),), generator=generator)] for side in sides]
+        return pool[torch.cat(rows)[:count]]
 
-    def lesson(self, shapes: Shapes, members: int, count: int, generator: torch.Generator) -> PointBatch:
-        """Points of random training members, `count` of each, member after member."""
+    def lesson(
+        self, shapes: Shapes, members: int, count: int, generator: torch.Generator, balanced: bool = False
+    ) -> PointBatch:
+        """Points of random training members, `count` of each, member after member; `balanced` as in `draw`."""
         there = shapes.splits["train"]
         drawn = there[torch.randint(len(there), (members,), generator=generator)].tolist()
-        return PointBatch.cat([self.draw(shapes, number, count, generator) for number in drawn])
+        return PointBatch.cat([self.draw(shapes, number, count, generator, balanced) for number in drawn])
 
 
 def sampled(

@@ -20,6 +20,7 @@ from ...run import Run
 from ...run.derived import Inferred
 from ...run.records import Protocol, ViewScores, compared_kind
 from ...synthetic import is_category
+from .published import of_scene
 
 SHEET = "views.png"
 MEMBERS = "-members"  # behind a collection's name: its members, averaged
@@ -228,6 +229,15 @@ class Begun:
 
 
 @dataclass(frozen=True)
+class ScenePSNR:
+    """Published held-out PSNR in dB of one scene, as results.json holds it."""
+
+    psnr: float
+    resolution: str
+    source: str
+
+
+@dataclass(frozen=True)
 class Measured:
     """Validated fields of cells that did not fail."""
 
@@ -245,7 +255,7 @@ class Measured:
     scores: list[Score] = field(default_factory=list)
     seconds_per_view: Lasted | None = None
     shown: ViewScores | None = None
-    published: Published | None = None
+    published: ScenePSNR | None = None
 
 
 @dataclass(frozen=True)
@@ -310,55 +320,10 @@ def read_rows(output: Path) -> dict[str, Row]:
     return {row["run"]: row for row in rows}
 
 
-@dataclass(frozen=True)
-class Published:
-    """Published held-out PSNR in dB of one scene, with resolution and source."""
-
-    psnr: float
-    resolution: str
-    source: str
-
-
-FIGURES: dict[tuple[str, str], Published] = {
-    ("nerf", "lego"): Published(32.54, "800x800", "Mildenhall et al. 2020"),
-    ("nerf", "chair"): Published(33.00, "800x800", "Mildenhall et al. 2020"),
-    ("nerf", "fern"): Published(25.17, "1008x756", "Mildenhall et al. 2020"),
-    ("mip-nerf", "lego"): Published(35.70, "800x800", "Barron et al. 2021"),
-    ("instant-ngp", "lego"): Published(36.39, "800x800", "Müller et al. 2022, black background"),
-    ("gaussian-splatting", "lego"): Published(35.78, "800x800", "Kerbl et al. 2023"),
-    ("tensorf", "lego"): Published(36.46, "800x800", "Chen et al. 2022"),
-}
-
-
-@dataclass(frozen=True)
-class Few:
-    """Published held-out PSNR in dB from few photographs, the mean of several scenes.
-
-    views: number of training photographs
-    protocol: the scenes, and the compared pixels
-    source: publication
-    """
-
-    method: str
-    psnr: float
-    views: int
-    protocol: str
-    source: str
-
-
-REGNERF_LLFF = "LLFF, 8 scenes, every 8th photograph held out, whole pictures"
-REGNERF_DTU = "DTU, 15 scenes, background masked out"
-PIXELNERF_DTU = "DTU, 15 scenes, whole pictures, other input views than RegNeRF's"
-NIEMEYER = "Niemeyer et al. 2022, arXiv 2112.00724"
-FEW_VIEW_FIGURES: tuple[Few, ...] = (
-    Few("mip-nerf", 14.62, 3, REGNERF_LLFF, NIEMEYER),
-    Few("regnerf", 19.08, 3, REGNERF_LLFF, NIEMEYER),
-    Few("mip-nerf", 8.68, 3, REGNERF_DTU, NIEMEYER),
-    Few("regnerf", 18.89, 3, REGNERF_DTU, NIEMEYER),
-    Few("pixelnerf", 19.33, 3, PIXELNERF_DTU, "Yu et al. 2021, arXiv 2012.02190"),
-)
-
-
-def published(method: str, scene: str) -> Published | None:
-    """Figure of the method's own paper for a scene of this name; `None` if unknown."""
-    return FIGURES.get((method, scene.lower()))
+def published(method: str, scene: str) -> ScenePSNR | None:
+    """Published figure of a method for a scene of this name; `None` if unknown."""
+    found = of_scene(method, scene)
+    if not found:
+        return None
+    resolution, _, rest = found.protocol.partition(", ")
+    return ScenePSNR(float(found.value), resolution, ", ".join(filter(None, (found.measured_by, rest))))

@@ -22,6 +22,7 @@ from ...opening import open_scene
 from ...run import Run
 from .cell import Cell, CellSettings, Row, read_rows
 from .conduct import STOP_CODES, Launch, conduct, launch, reason
+from .published import first_of
 from .table import size
 
 PAGE, LOG = "gallery.html", "captions.log"
@@ -35,12 +36,11 @@ CAPTION_NUMBERS = ("--pictures", "600", "--steps", "300")  # a minute of one pro
 
 @dataclass(frozen=True)
 class Showpiece:
-    """A method's entry. source: smallest suitable data; idea: its contribution in a line; known: published figure with
-    its protocol; options: further ones of `lumigraph train`; views: training photographs"""
+    """A method's entry. source: smallest suitable data; idea: its contribution in a line; options: further ones of
+    `lumigraph train`; views: training photographs"""
 
     source: str
     idea: str
-    known: str = ""
     options: tuple[str, ...] = ()
     views: int | None = None
 
@@ -50,7 +50,6 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
         "fourier-features": Showpiece(
             PICTURE,
             "A coordinate network learns detail once its input is a set of waves.",
-            "about 19 dB without, over 25 dB with, natural pictures (Tancik 2020)",
         ),
         "lumigraph": Showpiece(OBJECT, "Photographs blended ray by ray over a rough surface; no training."),
         "view-interpolation": Showpiece(OBJECT, "Neighbouring photographs warped forward by their depth; no training."),
@@ -62,12 +61,10 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
         "nerf": Showpiece(
             OBJECT,
             "Density and colour in the weights of a network, learnt through volume rendering.",
-            "31.01 dB, Blender's eight scenes at 800x800 (Mildenhall 2020)",
         ),
         "mip-nerf": Showpiece(
             OBJECT,
             "Pixels are cones, so that detail below a pixel fades instead of aliasing.",
-            "33.09 dB, Blender's eight scenes at 800x800 (Barron 2021)",
         ),
         "nerf-w": Showpiece(
             "procedural:tourists,size=120,views=60", "A code for the light of each photograph, and passers-by apart."
@@ -83,88 +80,58 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
         "regnerf": Showpiece(
             OBJECT,
             "Three photographs, and smooth depth in views that nobody took.",
-            "18.89 dB, DTU, three photographs, whole pictures (Niemeyer 2022)",
             views=3,
         ),
     },
     "Grids, tables and Gaussians": {
-        "dvgo": Showpiece(OBJECT, "Voxels of density and features.", "31.95 dB, Blender at 800x800 (Sun 2022)"),
-        "plenoxels": Showpiece(
-            OBJECT, "Sparse voxels of harmonics, no network.", "31.71 dB, Blender at 800x800 (Fridovich-Keil 2022)"
-        ),
-        "plenoctrees": Showpiece(
-            OBJECT, "Harmonics baked into an octree.", "31.71 dB, Blender at 800x800, over 150 frames/s (Yu 2021)"
-        ),
+        "dvgo": Showpiece(OBJECT, "Voxels of density and features."),
+        "plenoxels": Showpiece(OBJECT, "Sparse voxels of harmonics, no network."),
+        "plenoctrees": Showpiece(OBJECT, "Harmonics baked into an octree."),
         "snerg": Showpiece(
             OBJECT,
             "Baked blocks of voxels, one small network per pixel.",
-            "30.38 dB, Blender at 800x800, below 90 MB (Hedman 2021)",
         ),
-        "tensorf": Showpiece(
-            OBJECT, "Voxels as sums of products of planes and lines.", "33.14 dB, Blender at 800x800 (Chen 2022)"
-        ),
-        "instant-ngp": Showpiece(
-            OBJECT, "Hash tables of many resolutions.", "33.18 dB, Blender at 800x800, five GPU minutes (Müller 2022)"
-        ),
-        "gaussian-splatting": Showpiece(
-            OBJECT, "A cloud of Gaussians, rasterised.", "33.32 dB, Blender at 800x800, over 100 frames/s (Kerbl 2023)"
-        ),
+        "tensorf": Showpiece(OBJECT, "Voxels as sums of products of planes and lines."),
+        "instant-ngp": Showpiece(OBJECT, "Hash tables of many resolutions."),
+        "gaussian-splatting": Showpiece(OBJECT, "A cloud of Gaussians, rasterised."),
     },
     "Shape": {
         "occupancy-network": Showpiece(MESH, "A network that classifies points as inside or outside."),
         "deepsdf": Showpiece(MESH, "Signed distance of a point under the code of a shape."),
-        "nglod": Showpiece(MESH, "Codes in an octree, with levels of detail.", "19 to 904 kB a shape (Takikawa 2021)"),
+        "nglod": Showpiece(MESH, "Codes in an octree, with levels of detail."),
         "dvr": Showpiece(OBJECT, "Occupancy and texture from photographs by implicit differentiation."),
         "mesh-fit": Showpiece(OBJECT, "Triangles moved by gradients of a rasteriser, in large steps."),
         "voxel-fit": Showpiece(OBJECT, "Voxels fitted to photographs, the easy start of a mesh."),
-        "neus": Showpiece(OBJECT, "A signed distance as a radiance field.", "0.84 mm, DTU's 15 scans (Wang 2021)"),
-        "planar-splatting": Showpiece(
-            OBJECT, "Flat Gaussians whose depths agree.", "0.47 to 0.53 mm, DTU's 15 scans, half an hour (Chen 2024)"
-        ),
+        "neus": Showpiece(OBJECT, "A signed distance as a radiance field."),
+        "planar-splatting": Showpiece(OBJECT, "Flat Gaussians whose depths agree."),
     },
     "Depth cameras": {
         "tsdf-fusion": Showpiece(RECORDING, "Truncated signed distance averaged in hashed blocks of voxels."),
-        "imap": Showpiece(
-            RECORDING, "One network is the map and the tracker.", "4.2 cm, mean of TUM's three (Sucar 2021)"
-        ),
-        "splat-slam": Showpiece(RECORDING, "Gaussians as the map.", "3.35 cm, TUM fr1/desk (Keetha 2024)"),
+        "imap": Showpiece(RECORDING, "One network is the map and the tracker."),
+        "splat-slam": Showpiece(RECORDING, "Gaussians as the map."),
     },
     "What moves": {
-        "nerfies": Showpiece(
-            MOVING, "A field that bends from moment to moment.", "20.85 dB, DyCheck, masked (Park 2021)"
-        ),
-        "nsff": Showpiece(MOVING, "Scene flow between moments.", "19.53 dB, DyCheck, masked (Li 2021)"),
+        "nerfies": Showpiece(MOVING, "A field that bends from moment to moment."),
+        "nsff": Showpiece(MOVING, "Scene flow between moments."),
         "neural-volumes": Showpiece(
             "procedural:jelly,rig=12,size=80,views=120", "Photographs of a moment become a warped volume."
         ),
-        "deformable-splatting": Showpiece(
-            MOVING, "Gaussians moved by planes of space and time.", "34.05 dB, D-NeRF's eight scenes (Wu 2024)"
-        ),
-        "humannerf": Showpiece(
-            "procedural:walker", "A person before one camera, by bones.", "30.66 dB, ZJU-MoCap, ten hours (Weng 2022)"
-        ),
-        "articulated-splatting": Showpiece(
-            "procedural:walker", "Gaussians on bones, at any pose.", "31.8 dB, ZJU-MoCap, five minutes (Hu 2024)"
-        ),
+        "deformable-splatting": Showpiece(MOVING, "Gaussians moved by planes of space and time."),
+        "humannerf": Showpiece("procedural:walker", "A person before one camera, by bones."),
+        "articulated-splatting": Showpiece("procedural:walker", "Gaussians on bones, at any pose."),
     },
     "Objects and light": {
-        "neural-scene-graph": Showpiece(
-            "procedural:traffic,size=120,views=60", "Cars in boxes, with codes.", "26 dB, KITTI (Ost 2021)"
-        ),
+        "neural-scene-graph": Showpiece("procedural:traffic,size=120,views=60", "Cars in boxes, with codes."),
         "object-nerf": Showpiece(OBJECT, "A branch for the scene, a branch with a code for each object."),
         "nerfactor": Showpiece(
             "procedural:materials,size=100,views=30", "Shape, albedo, reflectance and light taken apart."
         ),
     },
     "Across scenes": {
-        "pixelnerf": Showpiece(
-            TOYS, "Features of photographs at points of a field.", "19.33 dB, DTU, three photographs (Yu 2021)"
-        ),
+        "pixelnerf": Showpiece(TOYS, "Features of photographs at points of a field."),
         "srn": Showpiece(CHAIRS, "A hypernetwork and a learnt ray marcher."),
         "hyp-nerf": Showpiece(TOYS, "A hypernetwork makes the hash table of an object."),
-        "eg3d": Showpiece(
-            TOYS, "A generator on three planes, learnt from an adversary.", "FID 4.70, FFHQ at 512 pixels (Chan 2022)"
-        ),
+        "eg3d": Showpiece(TOYS, "A generator on three planes, learnt from an adversary."),
     },
     "Imagination": {
         "dream-fields": Showpiece(
@@ -258,8 +225,8 @@ def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
         lines.append(" · ".join([*score, spent]))
         if path := picture_of(row, output):
             picture = f"<img src='{jpeg(path)}' alt='{escape(name)}'>"
-    if piece.known:
-        lines.append(f"published: {escape(piece.known)}")
+    if known := first_of(name):
+        lines.append(f"published, of other data: {escape(known.sentence)}")
     text = "".join(f"<p>{line}</p>" for line in lines)
     return f"<figure>{picture}<figcaption>{text}<code>{escape(row['command'])}</code></figcaption></figure>"
 

@@ -13,7 +13,8 @@ from ...evaluation.views import CAPTURED_POSES
 from ...figures.charts import COLOURS, Series
 from ...metrics import named, scores_of
 from ...run.records import compared_kind
-from .cell import FEW_VIEW_FIGURES, MEMBERS, Row, duration
+from .cell import MEMBERS, Row, duration
+from .published import FEW_VIEWS
 
 NONE = "–"
 
@@ -55,8 +56,7 @@ def few_photographs(rows: Sequence[Row]) -> str:
         parts += [f"{scores_of(found[0])[0].name} of {of_what}, {resolution(found[0])}:", table(names, lines)]
     if not parts:
         return ""
-    figures = [[f.method, str(f.psnr), str(f.views), f.protocol, f.source] for f in FEW_VIEW_FIGURES]
-    told = table(["method", "PSNR", "photographs", "protocol", "source"], figures)
+    told = few_view_results()
     return "\n\n".join(["## How many photographs", *parts, "Published results, each by its own protocol:", told])
 
 
@@ -155,6 +155,12 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 def trained_for(row: Row) -> str:
     """Budget of a cell as text, or the name of its prior."""
     return f"by {row['prior']}" if row.get("prior") else learnt_for(row)
+
+
+def few_view_results() -> str:
+    """Table of published results from few photographs."""
+    lines = [[x.method, x.value, str(x.views), f"{x.data}, {x.protocol}", x.measured_by, x.source] for x in FEW_VIEWS]
+    return table(["method", "PSNR", "photographs", "protocol", "measured by", "source"], lines)
 
 
 def resolution(row: Row) -> str:

@@ -47,6 +47,13 @@ class Config(BaseConfig):
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "brown-ivl/manus, config/model/gaussian/gaussian.yaml": (
+        "sh_degree ssim_weight densify_grad_threshold refine_every"
+    ),
+}
+
+
 class ArticulatedSplatting(Articulated, CloudMethod):
     """A canonical cloud on bones, posed to the moment of a photograph before it is rasterized."""
 

@@ -44,6 +44,19 @@ class Config(BaseConfig):
     tidying: TidyingNumbers = TidyingNumbers()
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "hustvl/4DGaussians, arguments/dnerf/dnerf_default.py (843d5ac)": (
+        "plane_scales motion_width still_until plane_smoothness time_smoothness time_sparsity planes_lr motion_lr "
+        "final_rate"
+    ),
+    "hustvl/4DGaussians, arguments/__init__.py (843d5ac)": (
+        "ssim_weight plane_resolution plane_moments plane_features"
+    ),
+    "hustvl/4DGaussians, scene/dataset_readers.py (843d5ac)": "initial_gaussians",
+    "hustvl/4DGaussians, scene/deformation.py (843d5ac), which has no such part": "nodes all_moments_from rigidity",
+}
+
+
 class DeformableSplatting(CloudMethod):
     """A canonical cloud, moved to the moment of a photograph before it is rasterized."""
 
@@ -64,8 +77,8 @@ class DeformableSplatting(CloudMethod):
         """A smaller cloud that begins dense, carried by nodes, coarser planes, and higher rates for few steps."""
         return changed(Config(tidying=ALL_RULES), initialization="dense", max_gaussians=40_000, cap_ramp=True,
             initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, most_haste=4.0, half_resolution_until=0.4,
-            plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08, planes_lr=4e-3,
-            motion_lr=1e-3, final_rate=0.1)  # fmt: skip
+            plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, rigidity=0.01, still_until=0.08,
+            planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -73,7 +86,8 @@ class DeformableSplatting(CloudMethod):
         return changed(
             Config(tidying=ALL_RULES), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1,
             initial_gaussians=200, ssim_weight=0.2, densify_grad_threshold=1e-6, opacity_reset_interval=5,
-            plane_resolution=4, plane_moments=4, plane_features=4, nodes=20, all_moments_from=0.3, still_until=0.0,
+            plane_resolution=4, plane_moments=4, plane_features=4, nodes=20, rigidity=0.01, all_moments_from=0.3,
+            still_until=0.0,
         )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -53,7 +53,7 @@ class MotionNumbers:
     still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
     all_moments_from: Share = 0.0  # share of the budget until which moments join, from the middle one on
     time_smoothness: NonNegative = 0.01  # weight of second differences of planes along time; higher: calmer motion
-    rigidity: NonNegative = 0.01  # weight of distances to neighbours that change; higher: stiffer bodies
+    rigidity: NonNegative = 0.0  # weight of distances to neighbours that change; 0: the release's unbounded motion
     planes_lr: LearningRate = 1.6e-3  # learning rate of the planes at first, times the extent of the cameras
     motion_lr: LearningRate = 1.6e-4  # learning rate of the network at first, likewise
     final_rate: PositiveShare = 0.01  # share of these rates at the end of the budget
@@ -114,6 +114,19 @@ def spread(points: Float[Tensor, "point 3"], count: int) -> Int[Tensor, " chosen
         best, cells = first, cells + max(1, cells // 8)
 
 
+def last_layer(outputs: int) -> nn.Linear:
+    """Layer from the hidden one that begins close to zero."""
+    last = nn.Linear(MOTION_WIDTH, outputs)
+    nn.init.uniform_(last.weight, -FIRST_MOTION, FIRST_MOTION)
+    nn.init.zeros_(last.bias)
+    return last
+
+
+def head() -> nn.Sequential:
+    """Layers from the common features to one output of three numbers, `scene/deformation.py` of the release."""
+    return nn.Sequential(nn.Linear(MOTION_WIDTH, MOTION_WIDTH), nn.ReLU(), last_layer(3))
+
+
 class PlaneMotion(Addition):
     """Positions, rotations and sizes of Gaussians at a moment, as offsets from the canonical cloud (Wu 2024, eq. 7).
 
@@ -146,9 +159,8 @@ class PlaneMotion(Addition):
         self.diagonal = float((high - low).norm())
         self.planes = SpaceTimePlanes(numbers)
         self.network = nn.Sequential(nn.Linear(self.planes.width, MOTION_WIDTH), nn.ReLU())
-        self.heads = nn.Linear(MOTION_WIDTH, 9)
-        nn.init.uniform_(self.heads.weight, -FIRST_MOTION, FIRST_MOTION)
-        nn.init.zeros_(self.heads.bias)
+        # The release's: a head for each output. With rigidity, one layer for all, as in runs so far.
+        self.heads: Any = last_layer(9) if numbers.rigidity else nn.ModuleList(head() for _ in range(3))
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
         self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
         self.register_buffer("nodes", torch.zeros(numbers.nodes, 3))
@@ -169,11 +181,12 @@ class PlaneMotion(Addition):
         share = (torch.as_tensor(time, device=means.device) - first) / (last - first)
         space = 2 * (means - self.box[0]) / (self.box[1] - self.box[0]) - 1
         places = torch.cat([space, (2 * share - 1).expand(len(means))[:, None]], 1)
-        raw = self.heads(self.network(self.planes(places)))
-        bound = MAX_OFFSET * self.diagonal
-        position, turn, size = raw.split(3, 1)
+        hidden = self.network(self.planes(places))
+        joint = bool(self.numbers.rigidity)
+        position, turn, size = self.heads(hidden).split(3, 1) if joint else (each(hidden) for each in self.heads)
         turn = normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
-        return bound * torch.tanh(position / bound), turn, size
+        bound = MAX_OFFSET * self.diagonal
+        return bound * torch.tanh(position / bound) if joint else position, turn, size
 
     def at(self, cloud: Gaussians, time: float) -> Gaussians:
         """The cloud at a moment; its static Gaussians are those of the canonical one."""
@@ -304,7 +317,7 @@ class PlaneMotion(Addition):
 
     def finish(self, step: Step) -> None:
         if step.due:
-            apart = bool(self.active) and step.progress >= TOLD_APART
+            apart = bool(self.active and self.numbers.rigidity) and step.progress >= TOLD_APART
             self.follow_cloud(step.learnt.means.detach(), apart)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:

@@ -43,6 +43,15 @@ class Config(BaseConfig):
     nonrigid: NonRigidNumbers = NonRigidNumbers()
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "chungyiweng/humannerf, configs/default.yaml (7389c40)": (
+        "hidden_width depth position_frequencies learning_rate final_learning_rate weight_cells weight_code weights_lr "
+        "pose_correction pose_depth pose_width pose_lr pose_from nonrigid_depth nonrigid_width nonrigid_frequencies "
+        "nonrigid_from nonrigid_until nonrigid_lr"
+    ),
+}
+
+
 class HumanNeRF(Articulated, FieldMethod):
     """A canonical field, and the deformation from a posed body to it."""
 

@@ -75,6 +75,14 @@ class Config(BaseConfig):
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "hyp-nerf/HyP-NeRF, nerf/network_fcblock.py": (
+        "log2_hashmap_size levels density_layers colour_layers shape_code colour_code code_deviation hyper_width "
+        "hyper_layers hidden_width"
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Observations of one scene: some rays, possibly occupied cells, and the background colour."""

@@ -96,6 +96,16 @@ class Config(BaseConfig):
     learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Sucar 2021, sections 3.1 to 3.4": (
+        "field layers hidden_width frequency_deviation coarse_samples fine_samples first_estimate tracking_pixels "
+        "window pixels_per_frame active_sampling keyframe_share depth_tolerance colour_weight depth_weight "
+        "distance_weight"
+    ),
+    "Sucar 2021, section 4": "learning_rate keyframe_pose_rate",
+}
+
+
 class IMap(FieldMethod):
     """One step is one frame: estimate its pose in the map, decide whether it is a keyframe, then optimise the map and
     the keyframes' poses jointly. Steps after the last frame continue mapping.

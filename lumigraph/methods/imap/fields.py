@@ -25,13 +25,14 @@ class MapNetwork(Field):
         (c, rho) = F(sin(B x)),   B ~ N(0, deviation^2), learnt
 
     layers, width: hidden ones; frequencies: rows of B
+    All in float32, because poses are tracked by its gradients.
     """
 
     def __init__(self, layers: int, width: int, frequencies: int, deviation: float):
         super().__init__()
         self.frequencies = nn.Parameter(deviation * torch.randn(frequencies, 3))
         widths = [frequencies, *[width] * layers]
-        hidden = [Dense(a, b, relu=True) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+        hidden = [Dense(a, b, relu=True, exact=True) for a, b in zip(widths[:-1], widths[1:], strict=True)]
         self.layers = nn.Sequential(*hidden)
         self.head = Dense(width, 4, exact=True)
 

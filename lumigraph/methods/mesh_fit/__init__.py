@@ -58,6 +58,11 @@ class Config(BaseConfig):
             raise LumigraphError("The last triangles cannot be larger than the first; give --cells more")
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "rgl-epfl/large-steps-pytorch, figures/comparison/generate_data.py": (
+        "start smoothness laplacian_weight normal_weight"
+    ),
+}
 SPHERE_RADIUS = 0.5  # of half the box of interest along each axis
 HULL_FINER = 2  # cells of the hull for one of the first mesh
 TEACHER_VIEWS, TEACHER_SIZE = 32, 200  # depth maps of a teacher, and pixels of their longer side

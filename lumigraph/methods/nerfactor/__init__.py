@@ -57,11 +57,14 @@ ANGLE_FREQUENCIES = 2  # octaves of encoded half-difference angles, of the learn
 CODE_WIDTH = 3  # numbers of a code of the learnt reflectance, section 3.3
 PRIOR_STEPS = 20_000  # steps in which the reflectance is learnt beforehand
 JITTER = 0.01  # standard deviation of the offsets of smoothness, scene units
-NORMAL_WEIGHT = 0.1  # weight of the distance from the geometry's normals; higher follows them
-VISIBILITY_WEIGHT = 0.1  # weight of the distance from traced visibility
-NORMAL_SMOOTHNESS = 0.01  # weight of smooth normals
-VISIBILITY_SMOOTHNESS = 0.01  # weight of smooth visibility
-ALBEDO_SMOOTHNESS = 0.01  # weight of smooth albedo; higher leaves more to shading
+SHAPE_WEIGHT = 1.0  # weight of the distances from the geometry's normals and visibility in the shape's stage
+SHAPE_LEARNING_RATE = 1e-2  # Adam's learning rate in the shape's stage
+NORMAL_WEIGHT = 0.1  # weight of the distance from the geometry's normals in joint training; higher follows them
+VISIBILITY_WEIGHT = 0.1  # weight of the distance from traced visibility in joint training
+NORMAL_SMOOTHNESS = 0.05  # weight of smooth normals
+VISIBILITY_SMOOTHNESS = 0.05  # weight of smooth visibility
+ALBEDO_SMOOTHNESS = 0.05  # weight of smooth albedo; higher leaves more to shading
+TABLE_SMOOTHNESS = 0.01  # the three of a hash table, which no release has
 CODE_SMOOTHNESS = 0.01  # weight of smooth reflectance
 LIGHT_VARIATION = 5e-6  # weight of the squared differences of neighbouring pixels of the light
 PROPERTY_WIDTH = 128  # width of a property's network, section 3
@@ -80,19 +83,28 @@ class Config(BaseConfig):
     visibility: Literal["network", "traced", "none"] = "network"  # of lights; none: no shadows, a baseline
     reflectance: Literal["learnt", "microfacet"] = "learnt"  # highlights: a learnt prior, or microfacets themselves
     geometry_share: Share = 0.5  # share of the budget in which geometry learns, before all else
-    shape_share: Share = 0.2  # share of the rest in which normals and visibility alone learn, with networks
+    shape_share: Share = 200 / 300  # share of the rest in which normals and visibility alone learn, with networks
     hidden_width: Width = 64  # neurons of a hidden layer behind hash tables; wider costs time
     light_rows: Annotated[int, between(4, 64)] = 16  # rows of the light's map, section 3.4; twice as many columns
     grid_resolution: Annotated[int, between(8, 512)] = 256  # cells along the box that hold the geometry
     surface_rays: BatchSize = 1024  # rays of a step once geometry is learnt; more reduce noise, and cost time
-    learning_rate: LearningRate = 1e-3  # Adam's learning rate of properties and light
-    final_learning_rate: LearningRate = 5e-4  # the same at the end, reached exponentially
-    light_rate: LearningRate = 1e-3  # learning rate of the light's logarithm
+    learning_rate: LearningRate = 5e-3  # Adam's learning rate of properties and light
+    final_learning_rate: LearningRate = 5e-3 * 0.1 ** (10 / 500)  # the same at the end, reached exponentially
+    light_rate: LearningRate = 5e-3  # learning rate of the light's logarithm
     geometry_rate: LearningRate = 1e-2  # learning rate of the geometry at first; higher: faster, may diverge
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of the geometry's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # residual of the geometry's loss at which it turns linear; 1: always squared
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google/nerfactor, nerfactor/config/nerfactor.ini (a668dca)": (
+        "properties visibility reflectance property_layers property_width position_frequencies direction_frequencies "
+        "light_rows surface_rays jitter normal_weight visibility_weight normal_smoothness visibility_smoothness "
+        "albedo_smoothness code_smoothness light_variation learning_rate final_learning_rate light_rate"
+    ),
+    "google/nerfactor, nerfactor/config/shape.ini (a668dca)": "shape_share shape_weight shape_learning_rate",
+    "google/nerfactor, nerfactor/config/brdf.ini (a668dca)": "angle_frequencies code_width",
+}
 MIN_ALBEDO, ALBEDO_RANGE = 0.03, 0.77  # section 3.3
 FIRST_LIGHT = 0.5  # radiance of the light at first, the middle of what the release draws
 DECAY_START = 0.3  # share of the geometry's stage before its rate falls
@@ -180,7 +192,7 @@ class NeRFactor(FieldMethod):
         """Tiny tables and a light of few pixels, in all stages within some twenty steps."""
         return Config(**TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
             reflectance="microfacet", geometry_share=0.6, shape_share=0.0, grid_resolution=16, huber_delta=1.0,
-            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2)  # fmt: skip
+            light_rows=4, surface_rays=128, learning_rate=3e-2, final_learning_rate=5e-4, light_rate=3e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -337,21 +349,25 @@ class NeRFactor(FieldMethod):
             """Mean over all rays of the step; rays without a surface count as zero."""
             return values.sum() / (len(batch) * values.shape[-1])
 
+        alone = self._over(self.progress) < c.shape_share  # the shape's stage
+        smooth = (NORMAL_SMOOTHNESS, VISIBILITY_SMOOTHNESS, ALBEDO_SMOOTHNESS)
+        smooth = smooth if c.properties == "network" else (TABLE_SMOOTHNESS,) * 3
         terms = {
-            "normals": NORMAL_WEIGHT * mean((seen.normals - given).square()),
-            "normal_smoothness": NORMAL_SMOOTHNESS * mean((seen.normals - near).abs()),
+            "normals": (SHAPE_WEIGHT if alone else NORMAL_WEIGHT) * mean((seen.normals - given).square()),
+            "normal_smoothness": smooth[0] * mean((seen.normals - near).abs()),
         }
         if self.lights_seen is not None:
             traced = self.grid.visibility(points, seen.normals.detach(), self.pixels[0])
             beside = self.lights_seen(jittered, self.pixels[0])
-            terms["visibility"] = VISIBILITY_WEIGHT * mean((seen.visibility - traced).square())
-            terms["visibility_smoothness"] = VISIBILITY_SMOOTHNESS * mean((seen.visibility - beside).abs())
-        if self._over(self.progress) < c.shape_share:
+            weight = SHAPE_WEIGHT if alone else VISIBILITY_WEIGHT
+            terms["visibility"] = weight * mean((seen.visibility - traced).square())
+            terms["visibility_smoothness"] = smooth[1] * mean((seen.visibility - beside).abs())
+        if alone:
             return terms
         error = mean((tone(seen.radiance) - tone(light)).square())
         self.figures = {"mse": float(error.detach()), "rays": len(batch), "surface_points": len(points)}
         terms["colour"] = error
-        terms["albedo_smoothness"] = ALBEDO_SMOOTHNESS * mean((seen.albedo - albedo_of(other.albedo)).abs())
+        terms["albedo_smoothness"] = smooth[2] * mean((seen.albedo - albedo_of(other.albedo)).abs())
         terms["code_smoothness"] = CODE_SMOOTHNESS * mean((seen.code - self.code_of(other.code)).abs())
         if c.light == "unknown":
             terms["light_variation"] = LIGHT_VARIATION * variation(self.log_light.exp())
@@ -373,13 +389,12 @@ class NeRFactor(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c = self.config
-        spent = min(progress / max(c.geometry_share, 1e-9), 1.0)
+        spent, over = min(progress / max(c.geometry_share, 1e-9), 1.0), self._over(progress)
+        joint = falling(c.learning_rate, c.final_learning_rate, over)
         return {
             "": hold_and_decay(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
-            "properties": falling(c.learning_rate, c.final_learning_rate, self._over(progress)),
-            "light": falling(
-                c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, self._over(progress)
-            ),
+            "properties": SHAPE_LEARNING_RATE if over < c.shape_share else joint,
+            "light": falling(c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, over),
         }
 
     def before_step(self, step: int, progress: float) -> None:

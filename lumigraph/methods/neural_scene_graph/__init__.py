@@ -50,12 +50,23 @@ class Config(BaseConfig):
     class_log2_hashmap_size: Annotated[int, between(1, 28)] = 17  # log2 of entries of a level of a class's hash table
     class_max_resolution: Annotated[int, between(1, 1 << 20)] = 256  # cells along a box of its finest level
     code_width: Annotated[int, between(1, 1024)] = 256  # numbers of an instance's latent code; more tell more apart
-    code_weight: NonNegative = 1e-4  # weight of codes squared, eq. 10; higher: instances are more alike
+    code_weight: NonNegative = 1e-4  # weight of codes' lengths, squared with tables; higher: instances are more alike
     box_samples: Annotated[int, between(2, 512)] = 7  # samples of a ray in a box, section 4.2; more are sharper, slower
     box_scale: Annotated[float, between(1, 4)] = 1.9  # factor on the boxes' sizes, which then hold shadows
     pose_input: Literal["location", "heading"] = "location"  # of a box, that colour depends on besides the direction
     symmetric: bool = False  # left and right sides of boxes are alike, so that either one shows the other
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
+
+
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "princeton-computational-imaging/neural-scene-graphs, example_configs/config_kitti_0006_example_train.txt": (
+        "rays_per_step code_width code_weight box_samples box_scale learning_rate"
+    ),
+    "princeton-computational-imaging/neural-scene-graphs, main.py (8d3d9ce)": (
+        "field depth skip_layer position_frequencies direction_frequencies hidden_width pose_input symmetric "
+        "huber_delta"
+    ),
+}
 
 
 class NeuralSceneGraph(FieldMethod):
@@ -267,7 +278,7 @@ class NeuralSceneGraph(FieldMethod):
             self.figures["mse"] = float(error.detach().square().mean())
             terms[each.name] = huber(error, c.huber_delta)
         self.figures["box_samples"] = sum(len(look.samples) for look in instances)
-        return terms | {"codes": c.code_weight * self.codes.square().mean()} | self.nodes.terms()
+        return terms | {"codes": prior_of(self.codes, c)} | self.nodes.terms()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         b = self.config.backbone
@@ -298,6 +309,12 @@ class NeuralSceneGraph(FieldMethod):
             else:
                 self.found = found_in(self, piece)
         self.arrange()
+
+
+def prior_of(codes: Float[Tensor, "track code"], config: Config) -> Float[Tensor, ""]:
+    """Prior of codes (eq. 10): the sum of their lengths, as the release has it; with hash tables, their mean square."""
+    size = codes.norm(dim=-1).sum() if config.backbone.field == "network" else codes.square().mean()
+    return config.code_weight * size
 
 
 def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ...], Float[Tensor, "track code"]]:
@@ -345,7 +362,7 @@ def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ..
             look = union([behind, *student.instance_looks(rays, chance)])
             seen = composite(look.samples, look.density, look.rgb, student.background)
             target = batch.rgb[rows] if batch.alpha is None else batch.before(student.background)[rows]
-            loss = (seen.rgb - target).square().mean() + method.config.code_weight * codes.square().mean()
+            loss = (seen.rgb - target).square().mean() + prior_of(codes, method.config)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

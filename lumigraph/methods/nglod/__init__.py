@@ -53,6 +53,14 @@ class Config(BaseConfig):
             )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "nv-tlabs/nglod, sdf-net/lib/options.py": (
+        "features hidden_width base_level pool_points near_share fine_spread points_per_step learning_rate"
+    ),
+    "nv-tlabs/nglod, sdf-net/README.md": "levels",
+}
+
+
 class NGLOD(SurfaceMethod):
     """Learns one shape. The control `level` is the level of detail, whole or between two."""
 

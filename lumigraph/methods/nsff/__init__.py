@@ -62,6 +62,18 @@ class Config(BaseConfig):
     static_field: bool = True  # a static field beside the dynamic one; off: the dynamic one shows everything
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "zhengqili/Neural-Scene-Flow-Fields, nsff_exp/configs/config_kid-running.txt (d400175)": (
+        "samples rays_per_step hidden_width neighbours cycle_weight smooth_weight flow_weight depth_weight "
+        "prior_interval"
+    ),
+    "zhengqili/Neural-Scene-Flow-Fields, nsff_exp/run_nerf.py (d400175)": (
+        "field depth position_frequencies direction_frequencies learning_rate static_field both_ways max_flow "
+        "occlusion_weight"
+    ),
+}
+
+
 class Hop(NamedTuple):
     """Samples of rays, warped to another time, with the dynamic field there.
 
@@ -252,8 +264,9 @@ class NSFF(FieldMethod):
             picture = composite(packed, there.density, there.rgb, background, weight=weight_so_far)
             certain = picture.extra["weight"][:, 0] + 1 - picture.opacity
             flow, (back, _) = self.toward(at.motion, way[ray])[0], self.toward(there.motion, 1 - way[ray])
-            values = {
-                "photometric": seen(known, certain * (picture.rgb - target).square().mean(-1)),
+            error = seen(known, certain * (picture.rgb - target).square().mean(-1))
+            values = {  # of both ways the mean weighted by certainty, as the release's; of one way the mean
+                "photometric": error / seen(known, certain).clamp_min(1e-6) if c.both_ways else error,
                 "occlusion": OCCLUSION_WEIGHT * seen(known[ray], 1 - weight[:, 0]),
                 "cycle": CYCLE_WEIGHT * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
             }

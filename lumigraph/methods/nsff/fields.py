@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -91,7 +92,7 @@ class MotionNetwork(SkipNetwork):
 
     def __init__(self, bands: int, depth: int, width: int, skip_layer: int):
         encoding = FrequencyEncoding(4, bands)
-        super().__init__(encoding.width, depth, width, skip_layer, Dense)
+        super().__init__(encoding.width, depth, width, skip_layer, partial(Dense, exact=True))
         self.encoding, self.last = encoding, Dense(width, 8, exact=True)
         nn.init.uniform_(self.last.weight, -FIRST_FLOW, FIRST_FLOW)
 

@@ -28,7 +28,16 @@ from ...geometry import unit
 from ...method import BaseConfig
 from ...method.depth import DepthNumbers
 from ...system.work import at_work
-from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patch_centres, single_view_error
+from .consistency import (
+    DISC_EDGE_POWER,
+    EDGE_POWER,
+    PlaneView,
+    grey_of,
+    multi_view_errors,
+    near_views,
+    patch_centres,
+    single_view_error,
+)
 from .planes import discs, plane_maps
 
 STOPS = {"mean": 1e-4, "median": 0.5}  # transmittance at which the planes of a pixel are finished
@@ -76,6 +85,20 @@ class Config(BaseConfig):
             raise LumigraphError(f"Patches of {self.planes.patch_side} pixels have no middle; give an odd --patch-side")
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "zju3dv/PGSR, arguments/__init__.py (de24f1a)": (
+        "flatness_weight normal_weight photometric_weight geometric_weight consistency_from patches patch_side "
+        "near_views view_angle sh_degree ssim_weight means_lr final_means_lr sh_lr opacities_lr scales_lr "
+        "quaternions_lr refine_every refine_from refine_until densify_grad_threshold opacity_reset_interval"
+    ),
+    "zju3dv/PGSR, train.py (de24f1a)": "edge_power depth both_views sh_degree_interval initialization",
+    "zju3dv/PGSR, train.py (de24f1a), which has no such step": (
+        "discs half_resolution_until most_haste max_gaussians cap_ramp prune_near limit_scale limit_anisotropy "
+        "observed_harmonics"
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Pair(Photograph):
     """A photograph and a neighbouring one.
@@ -105,7 +128,7 @@ class Planes(Addition):
         if step.progress < c.consistency_from:
             return
         here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera, c.stop))
-        step.terms["normals"] = c.normal_weight * single_view_error(here)
+        step.terms["normals"] = c.normal_weight * single_view_error(here, DISC_EDGE_POWER if c.discs else EDGE_POWER)
         other = step.photograph.other if isinstance(step.photograph, Pair) else None
         if other is None or not (c.photometric_weight or c.geometric_weight):
             return
@@ -114,7 +137,7 @@ class Planes(Addition):
             picture = splat(step.whole, view_of(camera, step.views.near_plane), 1, TRANSMITTANCE_THRESHOLD)
             there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera, c.stop))
         middle = patch_centres(step.photograph, here.maps, c.patch_side, c.patches, step.chance)
-        photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side)
+        photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side, not c.discs)
         step.terms["photometric"] = c.photometric_weight * photometric
         step.terms["geometric"] = c.geometric_weight * geometric
 

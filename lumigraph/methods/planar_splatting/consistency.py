@@ -16,7 +16,8 @@ from ...depth_maps.flat_view import GREY
 from ...geometry import unit
 from .planes import MIN_FACING, PlaneMaps, normals_of
 
-EDGE_POWER = 5  # of 1 - |gradient|, which weights the single-view term
+EDGE_POWER = 2  # of 1 - |gradient|, which weights the single-view term
+DISC_EDGE_POWER = 5  # the same of a cloud that begins as discs
 MIN_VARIANCE = 1e-4  # of grey values in a patch, below which it is flat and agrees with nothing
 MAX_REPROJECTION = 1.0  # pixels; a pixel that returns farther away is hidden from one view, and left out
 MAX_COST = 0.9  # 1 - NCC; a patch above it shows something else
@@ -37,10 +38,10 @@ def grey_of(photograph: Photograph) -> Float[Tensor, "height width"]:
     return photograph.before((0.0, 0.0, 0.0)) @ photograph.rgb.new_tensor(GREY)
 
 
-def single_view_error(view: PlaneView) -> Float[Tensor, ""]:
+def single_view_error(view: PlaneView, power: float = EDGE_POWER) -> Float[Tensor, ""]:
     """Edge-aware difference between the normals of depth and those of the planes:
 
-        mean of (1 - |grad I|)^5 |N_d - N|_1
+        mean of (1 - |grad I|)^power |N_d - N|_1
 
     with |grad I| in [0, 1], over pixels inside the border; zero where a pixel or a neighbour crosses no plane."""
     maps, inner = view.maps, (slice(1, -1), slice(1, -1))
@@ -48,7 +49,7 @@ def single_view_error(view: PlaneView) -> Float[Tensor, ""]:
     error = (normals_of(maps.depth, maps) * maps.opacity.detach()[inner][..., None] - maps.normals[inner]).abs().sum(-1)
     across, down = view.grey[1:-1, 2:] - view.grey[1:-1, :-2], view.grey[2:, 1:-1] - view.grey[:-2, 1:-1]
     edge = (across.square() + down.square()).sqrt()
-    smooth = (1 - edge / edge.max().clamp_min(1e-6)) ** EDGE_POWER
+    smooth = (1 - edge / edge.max().clamp_min(1e-6)) ** power
     return torch.where(whole, smooth * error, 0.0).mean()
 
 
@@ -75,14 +76,20 @@ def patch_centres(
 
 
 def multi_view_errors(
-    here: PlaneView, there: PlaneView, row: Int[Tensor, " patch"], column: Int[Tensor, " patch"], side: int
+    here: PlaneView,
+    there: PlaneView,
+    row: Int[Tensor, " patch"],
+    column: Int[Tensor, " patch"],
+    side: int,
+    over_accepted: bool = True,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Photometric and geometric error between two views, at some pixels of the first.
 
         phi(p) = |p - p'|      p' by the plane here to the other view, and by the plane there back again
         L_rgb = mean of exp(-phi) (1 - NCC(patch around p, the same patch through p's plane))      L_geo likewise of phi
 
-    over pixels with phi < 1; the weights get no gradient.
+    over pixels with phi < 1; the weights get no gradient. L_rgb has the mean over patches that are whole and agree, or
+    with `over_accepted` off over all, where the others count as zero.
     """
     maps, eye, other = here.maps, here.camera.position[0], there.camera.position[0]
     pixels = torch.stack([column, row], -1) + 0.5
@@ -111,8 +118,9 @@ def multi_view_errors(
     shown = looked_up(there.grey[..., None], moved)[:, 0].view(len(kept), -1)
     whole = (valid & inside(moved, there.camera)).view(len(kept), -1).all(-1)
     cost = 1 - correlation(here.grey[rows, columns], shown)
-    photometric = torch.where(whole & (cost < MAX_COST), weight * cost, 0.0).mean()
-    return photometric, geometric
+    accepted = whole & (cost < MAX_COST)
+    count = accepted.sum().clamp_min(1) if over_accepted else len(cost)
+    return torch.where(accepted, weight * cost, 0.0).sum() / count, geometric
 
 
 def correlation(a: Float[Tensor, "patch pixel"], b: Float[Tensor, "patch pixel"]) -> Float[Tensor, " patch"]:
