@@ -24,7 +24,7 @@ export class Cloud {
     this.texture(HARMONICS, gl.RGBA32UI, Math.max(1, degree * ROW), degree ? rows : 1);
     this.texture(MOTION, gl.RGBA32UI, ROW, moves ? rows : 1);
     this.frames = [0, 0].map(() => gl.createFramebuffer());
-    this.corners = gl.createVertexArray();
+    this.corners = rectangles(gl);
     this.sorter = new Sorter(rows * ROW, ROW);
     if (moves) {
       this.fill(MOTION, 0, moves.texels, ROW);
@@ -140,7 +140,7 @@ export class Cloud {
     gl.viewport(0, 0, size.x, size.y);
     const put = this.use(1, { shapes: SHAPES, looks: LOOKS });
     gl.uniform2f(put.size, size.x, size.y);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * ROW, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / ROW));
     if (!deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.use(2, { drawn: DRAWN });
@@ -171,6 +171,16 @@ export class Cloud {
     });
     gl.drawBuffers(places);
   }
+}
+
+// Corners of a row of rectangles, four each: an instance for each Gaussian would cost more than the Gaussian does.
+function rectangles(gl) {
+  const made = gl.createVertexArray(), numbers = new Uint16Array(6 * ROW);
+  for (let i = 0; i < ROW; i++) numbers.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner), 6 * i);
+  gl.bindVertexArray(made);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, numbers, gl.STATIC_DRAW);
+  return made;
 }
 
 // Rows for as many, by doubling, so that textures seldom change their size.
