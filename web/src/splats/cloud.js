@@ -10,7 +10,11 @@ import { Sorter } from "./sorter.js";
 export const ROW = 1024; // Gaussians in a row of each texture
 const BLUR = 0.3; // square pixels by which a footprint is widened
 const WHOLE = "const vec2 CORNERS[3] = vec2[](vec2(-1), vec2(3, -1), vec2(-1, 3)); void main() { gl_Position = vec4(CORNERS[gl_VertexID], 0, 1); }";
-const COPY = "precision highp float; uniform sampler2D drawn; out vec4 picture; void main() { picture = texelFetch(drawn, ivec2(gl_FragCoord.xy), 0); }";
+const COPY = `precision highp float; uniform sampler2D drawn; uniform vec2 size, whole; out vec4 picture;
+void main() {
+  picture = size == whole ? texelFetch(drawn, ivec2(gl_FragCoord.xy), 0)
+    : texture(drawn, min(gl_FragCoord.xy * size / whole, size - 0.5) / whole);
+}`;
 const [CLOUD, HARMONICS, MOTION, ORDER, SHAPES, LOOKS, DRAWN] = [0, 1, 2, 3, 4, 5, 6]; // units of textures
 
 export class Cloud {
@@ -19,6 +23,7 @@ export class Cloud {
     const gl = stage.renderer.getContext();
     const rows = Math.ceil(capacity / ROW);
     Object.assign(this, { stage, gl, degree, antialiased, placed, moves, ranges: [], time: 0, count: 0, made: {}, sizes: {} });
+    this.deep = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
     this.programs = [[WHOLE, projection], [vertex, fragment], [WHOLE, COPY]].map(([v, f]) => program(gl, v, f));
     this.texture(CLOUD, gl.RGBA32UI, 2 * ROW, rows);
     this.texture(HARMONICS, gl.RGBA32UI, Math.max(1, degree * ROW), degree ? rows : 1);
@@ -41,7 +46,8 @@ export class Cloud {
       gl.deleteTexture(this.made[unit] ?? null);
       gl.bindTexture(gl.TEXTURE_2D, (this.made[unit] = gl.createTexture()));
       gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+      const filter = format === gl.RGBA16F ? gl.LINEAR : gl.NEAREST;
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
       this.sizes[unit] = size;
     } else gl.bindTexture(gl.TEXTURE_2D, this.made[unit]);
     return this.made[unit];
@@ -68,40 +74,47 @@ export class Cloud {
 
   // Shows Gaussians begin <= i < end of each range, at a time in seconds.
   choose(ranges, time = this.time) {
-    Object.assign(this, { ranges, time, order: null });
+    if (time === this.time && ranges.join() === this.ranges.join()) return;
+    const chosen = ranges.reduce((sum, [begin, end]) => sum + end - begin, 0);
+    Object.assign(this, { ranges, time, chosen, order: null });
   }
 
-  // The order for the camera, as soon as the one that is under way is found; `order` names what it is for.
+  // The order for the camera, after any that is under way; `order` names what it is for. Returns whether it is a new one.
   async arrange() {
     while (this.sorting) await this.sorting;
+    this.stage.camera.updateMatrixWorld();
     const direction = new Vector3(0, 0, -1).transformDirection(this.stage.camera.matrixWorld);
-    direction.transformDirection(this.placed.clone().invert());
-    const wanted = direction.toArray();
-    if (this.order && this.order.every((value, i) => value === wanted[i])) return false;
+    const wanted = direction.transformDirection(this.placed.clone().invert()).toArray();
+    if (this.order?.every((value, i) => value === wanted[i])) return false;
     this.order = wanted;
-    const { time } = this;
-    this.sorting = this.sorter.sort(wanted, this.ranges, time);
-    const { order, count } = await this.sorting;
+    this.sorting = this.sort(wanted, this.ranges, this.time);
+    await this.sorting;
+    return true;
+  }
+
+  async sort(direction, ranges, time) {
+    const { order, count } = await this.sorter.sort(direction, ranges, time);
     this.sorting = null;
     Object.assign(this, { count, shown: time });
-    if (!count) return true;
+    if (!count) return;
     this.heights = grown(order.length / ROW, this.heights);
     this.texture(ORDER, this.gl.R32UI, ROW, this.heights);
     this.fill(ORDER, 0, order, ROW, this.gl.RED_INTEGER, 1);
     this.stage.renderer.resetState();
-    return true;
   }
 
-  paint() {
+  // scale: of the picture's sides, for a rough one
+  paint(scale) {
     const { gl, stage } = this, { camera, renderer } = stage;
     if (!this.count) return;
-    const size = renderer.getDrawingBufferSize(new Vector2());
+    const whole = renderer.getDrawingBufferSize(new Vector2());
+    const size = this.deep ? whole.clone().multiplyScalar(scale).ceil() : whole;
     camera.updateMatrixWorld();
     renderer.resetState();
     plain(gl);
     gl.bindVertexArray(this.corners);
     this.project(size);
-    this.splat(size);
+    this.splat(size, whole);
     renderer.resetState();
   }
 
@@ -127,13 +140,13 @@ export class Cloud {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  splat(size) {
-    const { gl } = this, deep = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  splat(size, whole) {
+    const { gl, deep } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (deep) {
-      this.onto(1, [DRAWN], gl.RGBA16F, size.x, size.y);
+      this.onto(1, [DRAWN], gl.RGBA16F, whole.x, whole.y);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
     }
@@ -143,7 +156,10 @@ export class Cloud {
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * ROW, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / ROW));
     if (!deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    this.use(2, { drawn: DRAWN });
+    gl.viewport(0, 0, whole.x, whole.y);
+    const copied = this.use(2, { drawn: DRAWN });
+    gl.uniform2f(copied.size, size.x, size.y);
+    gl.uniform2f(copied.whole, whole.x, whole.y);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
