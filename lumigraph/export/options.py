@@ -335,6 +335,10 @@ class PageOptions:
     """Training time of the octree that a field is converted to, in seconds."""
     duration: Annotated[Seconds | None, option("SECONDS", DURATION_TEXT)] = None
     """Time that a capture of moving splats takes when it is played; longer is slower."""
+    budget: Annotated[str, option("N", "auto: 1 M on phones, 3 M elsewhere")] = "auto"
+    """Splats drawn at most, the largest contribution first; fewer draw faster, with holes below a third of the cloud."""
+    stream: bool = False
+    """Write splats into a folder beside the page, in levels of detail that it loads over HTTP as the camera needs them."""
 
 
 @dataclass(frozen=True)
