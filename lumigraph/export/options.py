@@ -336,9 +336,9 @@ class PageOptions:
     duration: Annotated[Seconds | None, option("SECONDS", DURATION_TEXT)] = None
     """Time that a capture of moving splats takes when it is played; longer is slower."""
     budget: Annotated[str, option("N", "auto: 1 M on phones, 3 M elsewhere")] = "auto"
-    """Splats drawn at most, the largest contribution first; fewer draw faster, with holes below a third of the cloud."""
+    """Largest number of splats drawn, those that contribute most; a smaller one is faster and shows less detail."""
     stream: bool = False
-    """Write splats into a folder beside the page, in levels of detail that it loads over HTTP as the camera needs them."""
+    """Write splats as levels of detail in a folder beside the page, loaded over HTTP as the camera needs them."""
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,12 @@ PARALLAX_HELP = "Move the mouse to look behind things", "Tilt the phone, or drag
 def splats_page(path: Path, gaussians: Gaussians, opening: Opening, budget: int | None = None) -> None:
     """Write a page that renders a cloud in the scene's frame as splats with harmonics, stored as .spz, with its loss,
     those with the largest contribution first. budget: Gaussians drawn at most; None for the device's"""
-    settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased, "budget": budget}
+    settings = asdict(opening) | {
+        "webgl": True,
+        "packed": False,
+        "antialiased": gaussians.antialiased,
+        "budget": budget,
+    }
     with counting(f"Packing {len(gaussians):,} Gaussians"):
         packed = spz.gzipped(gaussians[contributions(gaussians).argsort(descending=True)], steps=HARMONICS_STEPS)
     write_bytes(path, page_bytes("splats", settings, packed), "page")
@@ -285,7 +290,8 @@ def export_page(
     bakes:  whether it becomes an octree where the options leave the kind open
     Raises LumigraphError for options that it cannot have.
     """
-    background, cameras, kind = background_of(options), loaded.cameras["train"], kind_of(loaded, options, bakes)
+    background, budget = background_of(options), budget_of(options)
+    cameras, kind = loaded.cameras["train"], kind_of(loaded, options, bakes)
     if options.stream and (kind != "splats" or loaded.moves):
         raise LumigraphError("Only a cloud of Gaussians that stands still is streamed; leave out --stream")
     if options.stream and streamed(loaded, path) is None:
@@ -316,7 +322,7 @@ def export_page(
         count, spans = len(moving) - moving.moving, moving.moving
         held = f"{count:,} Gaussians that stand still, {spans:,} spans of those that move"
         return held, {"still": count, "moving": spans}
-    gaussians, budget = loaded.gaussians(), budget_of(options)
+    gaussians = loaded.gaussians()
     if options.stream:
         meta = streamed(loaded, path)
         to_scene = loaded.frame.to_source.inverse.matrix

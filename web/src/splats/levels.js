@@ -56,9 +56,9 @@ class Levels {
     this.toLocal = cloud.placed.clone().invert();
   }
 
-  put(file, made) {
-    file.at = this.room(file);
-    this.cloud.hold(file.at, made);
+  put(file, made, at = this.room(file)) {
+    this.cloud.hold(at, made);
+    file.at = at;
   }
 
   // A row of the store from which on a file has room: behind all others, or in place of one that is not shown.
@@ -121,16 +121,17 @@ class Levels {
     if (this.loading >= AT_ONCE) return;
     const files = [...wanted].map(([leaf, level]) => this.used.get(leaf.lods[level].file));
     const next = files.find((file) => file.at === null && !file.asked);
-    if (!next) return;
+    const at = next ? this.room(next) : null;
+    if (at === null) return;
     next.asked = true;
     this.loading++;
     try {
-      const made = await fromSog(this.stage, new URL(next.name, this.base));
-      this.put(next, made);
-    } finally {
-      this.loading--;
+      this.put(next, await fromSog(this.stage, new URL(next.name, this.base)), at);
+      next.asked = false;
+    } catch (fault) {
+      console.warn(fault.message); // and a coarser level stays
     }
-    next.asked = false;
+    this.loading--;
     this.stage.redraw();
   }
 }
