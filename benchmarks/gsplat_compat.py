@@ -3,6 +3,7 @@
     python benchmarks/gsplat_compat.py                              every parameter: accepted, and its largest errors
     python benchmarks/gsplat_compat.py --tests CHECKOUT             gsplat's own tests, from its checkout, on this CPU
     python benchmarks/gsplat_compat.py --data PATH --steps 600      small trainings by strategies, on photographs
+    python benchmarks/gsplat_compat.py --own PATH --steps 600       a loop of public functions beside `lumigraph train`
     python benchmarks/gsplat_compat.py ... --publish                also write the figures for `tables.py`
 
 Errors are of pictures, opacities and gradients (of all tensors, of a camera's translation and of absgrad), of the
@@ -30,9 +31,11 @@ import torch
 
 import lumigraph
 from lumigraph import kernels
+from lumigraph.components.clouds.density_control import RefineNumbers
+from lumigraph.components.clouds.initialization import initial_cloud
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians.rasterization import matrices_of
-from lumigraph.gsplat import DefaultStrategy, MCMCStrategy
+from lumigraph.gsplat import DefaultStrategy, DensitySteps, MCMCStrategy
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
@@ -86,7 +89,9 @@ Row = dict[str, Any]
 class Options:
     tests: Path | None = None  # a checkout of gsplat
     data: Path | None = None  # photographs with poses and sparse points
+    own: Path | None = None  # photographs with poses, without distortion
     steps: int = 600  # of each training
+    seeds: tuple[int, ...] = (0, 1, 2)  # of --own
     downscale: int = 8
     strategies: tuple[str, ...] = ("default", "default absgrad", "mcmc", "none")
     seconds: float = 900  # after which gsplat's tests are ended; what has not run is not counted
@@ -99,6 +104,10 @@ class Options:
             found["owntests"] = own_tests(self.tests, self.seconds)
         if self.data:
             found["trainings"] = [training(name, self) for name in self.strategies]
+        if self.own:
+            rows = [own_loop(self.own, self, seed) for seed in self.seeds]
+            others = [row for row in found.get("loops", []) if row["scene"] != self.own.name]
+            found["loops"] = [*others, *rows]
         print(json.dumps(found, indent=1))
         if self.publish:
             commit = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True).strip()
@@ -108,6 +117,10 @@ class Options:
             found["commands"] = {
                 "parameters": [command],
                 "owntests": [f"{command} --tests CHECKOUT"],
+                "loops": [
+                    f"{command} --own {row} --steps {self.steps} --downscale {self.downscale}"
+                    for row in dict.fromkeys(row["scene"] for row in found.get("loops", []))
+                ],
                 "trainings": [f"{command} --data fox --steps {self.steps} --downscale {self.downscale}"],
             }
             found |= {"commit": commit, "machine": f"cpu, {os.cpu_count()} threads"}
@@ -248,10 +261,81 @@ def training(name: str, options: Options) -> Row:
         for i in scene.splits["test"].tolist():
             target = undistorted(i)
             picture, _, _ = seen(params, cameras[i : i + 1], Ks[i : i + 1], target, False)
-            scores.append(float(-10 * (picture[0].clamp(0, 1) - target).square().mean().log10()))
+            scores.append(psnr(picture[0], target))
     return {"strategy": name, "steps": options.steps, "psnr": sum(scores) / len(scores), "views": len(scores),
             "gaussians": len(params["means"]), "seconds": seconds, "scene": options.data.name,
             "size": f"{target.shape[1]} x {target.shape[0]}"}  # fmt: skip
+
+
+def own_loop(path: Path, options: Options, seed: int) -> Row:
+    """PSNR on held-out photographs of a loop of public functions with `DensitySteps`, and of `train` at equal steps."""
+    cap, steps, until = 20_000, options.steps, 0.75
+    scene = lumigraph.open_scene(path, downscale=options.downscale)
+    train, test, random = scene.splits["train"], scene.splits["test"][:12], torch.Generator().manual_seed(seed)
+    viewmats, Ks = matrices_of(scene.cameras)
+    has_alpha = scene.frame.has_alpha
+    beyond = torch.full((1, 3), 1.0 if has_alpha else 0.0)
+
+    start = initial_cloud(scene, "sparse", 10_000, cap, 3, random)
+    rates = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+    values = {"means": start.means, "quats": start.quaternions, "scales": start.log_scales,
+              "opacities": start.opacities, "sh0": start.harmonics[:, :1], "shN": start.harmonics[:, 1:]}  # fmt: skip
+    params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
+    optimizers = {name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15) for name, rate in rates.items()}
+    away = scene.cameras[train].position
+    extent = 1.1 * float((away - away.mean(0)).norm(dim=-1).max())
+    strategy = DensitySteps(steps, cap, "error", RefineNumbers(cap_ramp=True, refine_until=until))
+    state = strategy.initialize_state(len(start), extent, seed)
+
+    def picture(i: int, background: torch.Tensor, bands: int, **further: Any) -> tuple[torch.Tensor, Any]:
+        height, width, _ = scene.photograph(i).rgb.shape
+        rgb, _, info = lumigraph.rasterization(
+            params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
+            torch.cat([params["sh0"], params["shN"]], 1), viewmats[i : i + 1], Ks[i : i + 1], width, height,
+            sh_degree=bands, backgrounds=background, near_plane=0.1 * scene.frame.near, **further)  # fmt: skip
+        return rgb[0], info
+
+    order: list[int] = []
+    for step in range(steps):
+        order = order or train[torch.randperm(len(train), generator=random)].tolist()
+        i, share = order.pop(), step / steps
+        behind = torch.rand(1, 3, generator=random) if has_alpha else beyond
+        target = scene.photograph(i).before(behind[0])
+        optimizers["means"].param_groups[0]["lr"] = extent * 1.6e-4 * 0.01**share
+        explained = torch.zeros(len(params["means"]), requires_grad=True)
+        rgb, info = picture(i, behind, min(3, int(8 * share)), extra_signals=explained[:, None])
+        target = torch.where(trusted(scene.photograph(i)), target, rgb.detach())
+        ssim, l1 = kernels.photometric(rgb, target)
+        error = (rgb - target).detach().abs().mean(-1)
+        loss = 0.8 * l1 + 0.2 * (1 - ssim) + (info["render_extra_signals"][0, ..., 0] * error / error.numel()).sum()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        info["explained"] = explained
+        strategy.step(params, optimizers, state, step + 1, info)
+    with tempfile.TemporaryDirectory() as folder:
+        model = lumigraph.train(path, "gaussian-splatting", Path(folder) / "run", preset="paper", strategy="error",
+            steps=steps, downscale=options.downscale, seed=seed, max_gaussians=cap, cap_ramp=True, refine_until=until,
+            initial_gaussians=10_000)  # fmt: skip
+        with torch.no_grad():
+            truth = [(i, scene.photograph(i).before(beyond[0]), trusted(scene.photograph(i))) for i in test.tolist()]
+            theirs = [
+                psnr(model.render(scene.cameras[i]).rgb[kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth
+            ]
+            ours = [psnr(picture(i, beyond, 3)[0][kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth]
+    return {"scene": path.name, "steps": steps, "seed": seed, "own": sum(ours) / len(ours),
+            "train": sum(theirs) / len(theirs), "gaussians": len(params["means"]), "views": len(ours)}  # fmt: skip
+
+
+def trusted(photograph: Any) -> torch.Tensor:
+    """Mask of the pixels that are learnt and compared, (height, width, 1)."""
+    whole = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool)
+    return (whole if photograph.mask is None else photograph.mask)[..., None]
+
+
+def psnr(picture: torch.Tensor, target: torch.Tensor) -> float:
+    return float(-10 * (picture.clamp(0, 1) - target).square().mean().log10())
 
 
 def seen(params: Any, viewmats: Any, Ks: Any, target: Any, absolute: bool) -> tuple[Any, Any, Any]:

@@ -8,8 +8,8 @@ OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMI
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
 choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
-`table: reading` of `reading.py --publish`; `parameters`, `owntests` and `trainings` of `gsplat_compat.py --publish`;
-`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+`table: reading` of `reading.py --publish`; `parameters`, `owntests`, `trainings`, `loops` of `gsplat_compat.py
+--publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations
@@ -275,6 +275,15 @@ def by_strategy(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
+def by_loop(cells: Sequence[Row], page: Path) -> list[str]:
+    """A loop of public functions beside `lumigraph train`."""
+    rows = [["capture", "steps", "seed", "own loop, dB", "`train`, dB", "Gaussians"]]
+    for row in cells:
+        told = [row["scene"], str(row["steps"]), str(row["seed"]), f"{row['own']:.2f}", f"{row['train']:.2f}"]
+        rows.append([*told, f"{row['gaussians']:,}"])
+    return markdown(rows)
+
+
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
     score = next(iter(scores_of(row)))
@@ -299,6 +308,7 @@ KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "parameters": by_parameter,
     "owntests": by_test,
     "trainings": by_strategy,
+    "loops": by_loop,
 }
 OTHERS = {
     "sections": "gallery",
@@ -309,6 +319,7 @@ OTHERS = {
     "parameters": "parameters",
     "owntests": "owntests",
     "trainings": "trainings",
+    "loops": "loops",
 }  # where the figures of a table are
 
 

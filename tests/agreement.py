@@ -132,7 +132,7 @@ def assert_agrees(
             expected,
             rtol=1e-4,
             atol=1e-5 * scale,
-            msg=lambda report, i=i: f"{name} on {engine}, result {i}: {report}",
+            msg=lambda report, i=i: f"{name} on {engine}, case {case}, result {i}: {report}",
         )
 
 

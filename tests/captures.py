@@ -78,6 +78,19 @@ def write_ngp(folder: Path, tiny: Tiny, **extra: Any) -> Path:
     return folder
 
 
+def write_nsvf(folder: Path, tiny: Tiny, split: bool = True) -> Path:
+    """Lines of SRN for the camera; names of NSVF, with the last of two pictures for tests."""
+    tiny.write_images(folder / "rgb")
+    (folder / "pose").mkdir()
+    for i, (path, pose) in enumerate(zip(sorted((folder / "rgb").iterdir()), tiny.poses, strict=True)):
+        path = path.rename(path.with_name(f"{2 * (i % 2)}_{path.name}")) if split else path
+        np.savetxt(folder / "pose" / f"{path.stem}.txt", pose.reshape(1, 16) if i % 2 else pose)
+    camera = f"{FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.\n0. 0. 0.\n0.\n1.\n{HEIGHT} {WIDTH}\n"
+    (folder / "intrinsics.txt").write_text(camera)
+    (folder / "bbox.txt").write_text("-1 -1 -1 1 1 1 0.4\n")
+    return folder
+
+
 def write_nerfstudio(folder: Path, tiny: Tiny, **extra: Any) -> Path:
     """Intrinsics frame by frame, points in a PLY file."""
     tiny.write_images(folder / "images")

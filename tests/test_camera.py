@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
@@ -113,6 +114,14 @@ def test_cosines_are_those_of_the_rays(kind, generator):
 def test_pixels_of_several_cameras_at_once_are_refused(generator):
     with pytest.raises(ValueError, match="one camera at a time"):
         random_camera("pinhole", generator).pixels()
+
+
+@pytest.mark.parametrize("index", [2, np.int64(2), torch.tensor(2), slice(2, 3), torch.tensor([2]), -2])
+def test_one_camera_by_any_integer(index):
+    cameras = Camera(torch.eye(3, 4).repeat(4, 1, 1), Pinhole(torch.rand(4, 2) + 9, torch.rand(4, 2)),
+                     torch.tensor([[8, 6]] * 4), torch.arange(4.0), torch.arange(4))  # fmt: skip
+    one = cameras[index]
+    assert len(one) == 1 and one.image_index.tolist() == [2] and torch.equal(one.lens.focal, cameras.lens.focal[2:3])
 
 
 @pytest.mark.parametrize("kind", KINDS)

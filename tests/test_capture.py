@@ -388,6 +388,32 @@ def test_colmap_masks_are_found(tiny, tmp_path):
     assert scene.images.trusted_pixels.tolist() == [48 * 36] * 2 + [48 * 33] + [48 * 36] * 7
 
 
+def test_a_matrix_for_each_frame(tiny, tmp_path):
+    folder = write_ngp(tmp_path, tiny, fl_x=None, fl_y=None, cx=None, cy=None)
+    whole = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(whole["frames"]):
+        frame["intrinsic_matrix"] = [[30.0 + i, 0, 11.5, 0], [0, 32, 8.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    write_json(folder / "transforms.json", whole)
+    lens = open_scene(folder).cameras.lens
+    assert lens.focal[2].tolist() == [32, 32] and lens.centre[2].tolist() == [11.5, 8.5]
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "cloud"),
+    [
+        ("scan.txt", ["0.1 0.2 0.3"] * 20, True),
+        ("scan.csv", ["x,y,z,r,g,b", *["0.1,0.2,0.3,4,5,6"] * 20], True),
+        ("path.txt", ["1.5 0 0 0 0 0 0 1"] * 20, False),  # a trajectory
+        ("matrix.txt", ["1 0 0 0"] * 4, False),
+        ("notes.txt", ["taken in the garden"] * 20, False),
+    ],
+)
+def test_tables_of_points_are_known(name, lines, cloud, tmp_path):
+    (tmp_path / name).write_text("\n".join([*lines, ""]))
+    with pytest.raises(LumigraphError, match="is a cloud of points" if cloud else "no camera poses|is a file"):
+        open_scene(tmp_path / name)
+
+
 def test_the_black_around_a_fisheyes_circle_is_not_learnt(tiny, tmp_path):
     scene = open_scene(write_ngp(tmp_path, tiny, camera_model="OPENCV_FISHEYE", fl_x=9, fl_y=9, k1=-0.08))
     lens = scene.cameras.lens

@@ -26,6 +26,7 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import (
     Division,
+    EnhancedUnified,
     Equirectangular,
     FieldOfView,
     Fisheye,
@@ -334,6 +335,7 @@ def lens_of(kind: str) -> tuple[Lens, tuple[int, int]]:
             focal / 3, centre, torch.tensor([[0.05, *[0] * 5, 1e-3, -1e-3, 1e-3, *[0] * 3]])
         ),
         "fieldofview": FieldOfView(focal, centre, torch.tensor([[0.8]])),
+        "enhancedunified": EnhancedUnified(focal, centre, torch.tensor([[0.4]]), torch.tensor([[1.1]])),
         "division": Division(focal, centre, torch.tensor([[-0.1]])),
         "equirectangular": Equirectangular(whole),
         "omnidirectionalstereo": OmnidirectionalStereo(whole, offset=torch.tensor([[0.03]])),

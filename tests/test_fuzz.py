@@ -69,6 +69,7 @@ SCENES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "llff": (lambda folder: captures.write_llff(folder, captures.Tiny(4)), ("*.npy",)),
     "nerfies": (lambda folder: captures.write_nerfies(folder, captures.Tiny(4)), ("*.json", "camera/*", "*.npy")),
     "nr-nerf": (lambda folder: captures.write_nr_nerf(folder, captures.Tiny(4)), ("*.json",)),
+    "nsvf": (lambda folder: captures.write_nsvf(folder, captures.Tiny(4)), ("*.txt", "pose/*")),
     "shapes": (templates.write_shapes, ("*",)),
 }
 

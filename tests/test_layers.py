@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_json, write_ngp
+from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_json, write_ngp, write_nsvf
 from deep_files import write_exr, write_png16
 from PIL import Image
 
@@ -369,6 +369,38 @@ def test_seven_scenes(tiny, tmp_path):
     (tmp_path / "frame-000003.pose.txt").write_text("1 2 3")
     with pytest.raises(LumigraphError, match=r"frame-000003\.pose\.txt holds no 4x4 matrix"):
         open_scene(tmp_path)
+
+
+def test_pictures_poses_and_a_pinhole_in_text_files(tiny, tmp_path):
+    """Of SRN and NSVF, and of NeRF++, which has a camera for each picture and a folder for each split."""
+    scene = open_scene(write_nsvf(tmp_path / "nsvf", tiny))
+    assert len(scene.splits["test"]) == len(tiny.poses) // 2 and scene.names[0].startswith("rgb/0_")
+    plus = write_nsvf(tmp_path / "plus", tiny, split=False)
+    other = tmp_path / "other"
+    for i, pose in enumerate(sorted((plus / "pose").iterdir())):
+        part = other / ("test" if i == 3 else "train")
+        for kind, text in (
+            ("pose", pose.read_text()),
+            ("intrinsics", f"{FOCAL} 0 {WIDTH / 2} 0 0 {FOCAL} {HEIGHT / 2}"),
+        ):
+            (part / kind).mkdir(parents=True, exist_ok=True)
+            (part / kind / pose.name).write_text(text + (" 0 0 0 1 0 0 0 0 1" if kind == "intrinsics" else ""))
+        (part / "rgb").mkdir(exist_ok=True)
+        (plus / "rgb" / f"{pose.stem}.png").rename(part / "rgb" / f"{pose.stem}.png")
+    found = open_scene(other)
+    assert len(found) == len(scene) == len(tiny.poses) and len(found.splits["test"]) == 1
+    for one in (scene, found):
+        matrix = one.frame.source_from_scene
+        for i, name in enumerate(one.names):
+            number = int("".join(x for x in name.rpartition("/")[2].partition(".")[0][-4:] if x.isdigit()))
+            centre = one.cameras.pose[i, :3, 3].double() @ torch.as_tensor(matrix)[:3, :3].T.double()
+            centre = centre + torch.as_tensor(matrix)[:3, 3]
+            np.testing.assert_allclose(centre, tiny.poses[number][:3, 3], atol=1e-4)
+            assert one.cameras.lens[i].focal[0].tolist() == pytest.approx([FOCAL, FOCAL])
+    (other / "test" / "intrinsics").rename(other / "test" / "k")
+    (other / "train" / "intrinsics" / next((other / "train" / "pose").iterdir()).name).write_text("1 2")
+    with pytest.raises(LumigraphError, match="holds neither a matrix of 4x4 or 3x3 nor f cx cy"):
+        open_scene(other)
 
 
 def test_procedural_scenes_give_all_they_know_to_those_who_ask(tmp_path, monkeypatch, generator):

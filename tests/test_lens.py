@@ -13,6 +13,7 @@ import torch
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import (
     Division,
+    EnhancedUnified,
     Equirectangular,
     FieldOfView,
     Fisheye,
@@ -63,6 +64,9 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
         return RadialThinPrism(focal, centre, spread * uniform(generator, -1, 1, CAMERAS, 12)), size
     if kind == "field of view":
         return FieldOfView(focal, centre, uniform(generator, 0, 1.2, CAMERAS, 1)), size
+    if kind == "enhanced unified":
+        alpha, beta = uniform(generator, 0, 1, CAMERAS, 1), uniform(generator, 0.5, 2, CAMERAS, 1)
+        return EnhancedUnified(focal, centre, alpha, beta), size
     if kind == "division":
         return Division(focal, centre, uniform(generator, -0.3, 0.2, CAMERAS, 1)), size
     if kind == "equirectangular":
@@ -84,6 +88,7 @@ KINDS = [
     "radial thin prism",
     "field of view",
     "division",
+    "enhanced unified",
     *SPHERES,
 ]
 
@@ -190,6 +195,9 @@ def test_colmap_means_the_same(kind, model, generator):
             "RAD_TAN_THIN_PRISM_FISHEYE",
             [310, 300, 322, 241, -0.026, 0.095, -0.064, 9e-3, 3e-3, -6e-4, 1e-3, -2e-3, -3e-3, 1e-3, 2e-3, -1e-3],
         ),
+        ("EUCM", [310, 300, 322, 241, 0.6, 1.1]),
+        ("EUCM", [310, 300, 322, 241, 0.3, 0.8]),
+        ("EUCM", [310, 300, 322, 241, 0.0, 1.0]),
         ("FOV", [310, 300, 322, 241, 0.9]),
         ("FOV", [310, 300, 322, 241, 0.0]),
         ("DIVISION", [310, 300, 322, 241, -0.2]),

@@ -11,6 +11,7 @@ from budgets import budget
 
 import lumigraph
 from lumigraph.camera import Camera, ring
+from lumigraph.camera.lens import EnhancedUnified, FieldOfView, Fisheye
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export import cameras as many
@@ -90,6 +91,28 @@ def test_a_spinning_sensor_gives_ranges(shell):
     assert (seen.depth.flatten() / exact - 1).abs().median() < 0.015
     elevation = torch.rad2deg(torch.asin(-(rays.directions @ pose[0, :, 1])))
     assert elevation.max().item() == pytest.approx(15 - 15 / 16, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lens", "least"),
+    [
+        (Fisheye(torch.full((1, 2), 13.0), torch.full((1, 2), 24.0), torch.zeros(1, 4)), 1.75),  # past 90 degrees
+        (FieldOfView(torch.full((1, 2), 30.0), torch.full((1, 2), 24.0), torch.tensor([[0.9]])), 0.6),
+        (EnhancedUnified(*torch.full((2, 1, 2), 20.0), *torch.tensor([[[0.6]], [[1.1]]])), 0.6),
+    ],
+)
+def test_clouds_are_seen_through_lenses_without_a_flat_picture(lens, least, shell):
+    """Off centre, as above: colours and ranges are those of the wall along each ray."""
+    run = lumigraph.open(shell, metres=1.0)
+    pose = looking_out(1)
+    pose[:, :, 3] = torch.tensor([0.4, 0.2, -0.3])
+    camera = Camera(pose, lens, torch.tensor([[48, 48]]))
+    seen = run.render(run.placed(camera))
+    rays = camera.rays(camera.pixels())
+    assert float((rays.directions @ pose[0, :, 2]).min().acos()) > least
+    along = (rays.origins * rays.directions).sum(-1)
+    exact = -along + (along**2 - rays.origins.square().sum(-1) + RADIUS**2).sqrt()
+    assert (seen.depth.flatten() / exact - 1).abs().median() < 0.015 and seen.opacity.min() > 0.9
 
 
 def test_readers_of_depth_cameras_know_the_metre():

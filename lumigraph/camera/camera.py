@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -48,7 +49,7 @@ class Camera:
         where = f" at {[round(x, 3) for x in self.position[0].tolist()]}" if len(self) == 1 else ""
         return f"Camera: {len(self)} {type(self.lens).__name__}, {shown} pixels{where}"
 
-    def __getitem__(self, index: int | slice | Tensor) -> Camera:
+    def __getitem__(self, index: int | np.integer | slice | Tensor) -> Camera:
         """Some of the cameras; an int gives a batch of one."""
         keep = one_or_more(index)
         time, image_index = (None if x is None else x[keep] for x in (self.time, self.image_index))

@@ -14,6 +14,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -29,7 +30,7 @@ NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
 CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
 PARAMETER_RANGES = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
-PARAMETER_RANGES |= {"offset": (-1e6, 1e6)}
+PARAMETER_RANGES |= {"offset": (-1e6, 1e6), "alpha": (0.0, 1.0), "beta": (1e-3, 1e3)}
 DEFAULT_RANGE = (-1e9, 1e9)  # for further parameters of a new kind of lens
 Distorted = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]  # (x', y') and its Jacobian, row by row
 NO_INDEX = torch.empty(0, dtype=torch.int64)
@@ -105,7 +106,7 @@ class Lens(ABC):
     def __len__(self) -> int:
         return len(next(iter(self._numbers().values())))
 
-    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+    def __getitem__(self, index: int | np.integer | slice | Tensor) -> Lens:
         """The lenses of some cameras; an int gives a batch of one."""
         return self._map(lambda x: x[one_or_more(index)])
 
@@ -418,6 +419,38 @@ class Division(FieldOfView):
 
 
 @dataclass(frozen=True)
+class EnhancedUnified(Lens):
+    """Wide lens of two parameters (Khomutenko et al. 2016; COLMAP's EUCM), from (x, y, z) to the plane:
+
+    (x, y) -> (x, y) / (alpha d + (1 - alpha) z),    d^2 = beta (x^2 + y^2) + z^2
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+    alpha: Float[Tensor, "camera 1"]
+    beta: Float[Tensor, "camera 1"]
+
+    def unproject(self, pixels, index=None):
+        plane = (pixels - rows(self.centre, index)) / rows(self.focal, index)
+        alpha, beta = rows(self.alpha, index), rows(self.beta, index)
+        bent = beta * (2 * alpha - 1)  # over 0 where the plane ends, at a radius of bent^-1/2
+        plane = plane * (bent.clamp_min(1e-12).rsqrt() / plane.norm(dim=-1, keepdim=True).clamp_min(1e-6)).clamp_max(1)
+        s = plane.square().sum(-1, keepdim=True)
+        z = (1 - beta * alpha**2 * s) / (alpha * (1 - bent * s).clamp_min(0).sqrt() + 1 - alpha).clamp_min(1e-6)
+        return torch.nn.functional.normalize(torch.cat([plane, z], -1), dim=-1)
+
+    def project(self, points, index=None):
+        alpha, beta = rows(self.alpha, index), rows(self.beta, index)
+        z = points[:, 2:]
+        d = (beta * points[:, :2].square().sum(-1, keepdim=True) + z * z).sqrt()
+        below = alpha * d + (1 - alpha) * z
+        share = torch.minimum(alpha, 1 - alpha) / torch.maximum(alpha, 1 - alpha)
+        valid = (z > -share * d) & (below > 1e-6 * d)
+        pixels = points[:, :2] / torch.where(valid, below, 1) * rows(self.focal, index) + rows(self.centre, index)
+        return pixels, valid[:, 0]
+
+
+@dataclass(frozen=True)
 class Equirectangular(Lens):
     """Equirectangular panorama: longitude across, latitude down. The top looks along -y.
 
@@ -547,7 +580,7 @@ class Mixed(Lens):
     def __len__(self) -> int:
         return len(self.part)
 
-    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+    def __getitem__(self, index: int | np.integer | slice | Tensor) -> Lens:
         kept = one_or_more(index)
         pairs = zip(self.part[kept].tolist(), self.row[kept].tolist(), strict=True)
         return mix([self.parts[part][row] for part, row in pairs])
@@ -587,11 +620,12 @@ def area(sides: Tensor, index: Tensor | None) -> Tensor:
     return columns(sides.prod(-1, keepdim=True), index)[0]
 
 
-def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
-    """An index that keeps the camera axis: an int becomes a slice of length one."""
-    if isinstance(index, int):
+def one_or_more(index: int | np.integer | slice | Tensor) -> slice | Tensor:
+    """An index that keeps the camera axis: an integer, also NumPy's or a tensor, becomes a slice of length one."""
+    if getattr(index, "ndim", 0 if isinstance(index, int) else 1) == 0:
+        index = int(index)  # type: ignore[arg-type]
         return slice(index, index + 1 if index != -1 else None)
-    return index
+    return index  # type: ignore[return-value]
 
 
 def small(step: Tensor) -> bool:

@@ -9,13 +9,13 @@ import numba
 import torch
 
 from ..camera import Camera
-from ..camera.lens import Equirectangular
+from ..camera.lens import Equirectangular, OpenCV, Pinhole
 from ..camera.rays import Rendering
 from ..method import Method
 from ..method.capabilities import HasGaussians, can, needs
 from ..system.threads import processors
 from ..system.work import at_work
-from .panorama import sphere
+from .panorama import sphere, through_lens
 
 # Of a picture and of a cloud, up to which each thread renders a picture of its own (`benchmarks/many_cameras.py`).
 PARALLEL_PIXELS, PARALLEL_GAUSSIANS = 640 * 480, 300_000
@@ -52,6 +52,8 @@ def picture_of(method: Method, camera: Camera) -> Rendering:
     with at_work(), torch.no_grad():
         if isinstance(camera.lens, Equirectangular) and not method.any_lens:
             return sphere(method, camera, "Around")
+        if not isinstance(camera.lens, Pinhole | OpenCV) and not method.any_lens:
+            return through_lens(method, camera)
         return method.render(camera)
 
 

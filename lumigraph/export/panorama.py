@@ -1,7 +1,7 @@
-"""Equirectangular panoramas of any method.
+"""Equirectangular panoramas of any method, and pictures of any lens.
 
-Methods with rays of any lens render it directly. Gaussians are rendered on flat pictures only, so the sphere is
-assembled from many small ones, each for a few columns and a band of rows, with interpolation.
+Methods with rays of any lens render it directly. Gaussians are rendered on flat pictures only, so a sphere or the
+picture of a fisheye is assembled from many small ones, each for a few columns and a band of rows, with interpolation.
 
 Omnidirectional stereo is a panorama for each eye. The rays of both eyes are tangents of a level circle
 (`lens.OmnidirectionalStereo`; Peleg 2001), so the eyes are side by side in every direction. At the poles parallax
@@ -9,6 +9,7 @@ fades.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +40,7 @@ from .options import EyesOptions, SphereOptions
 
 PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two updates of the progress bar
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
+PATCH_ANGLE, LAP_SHARE = math.radians(40), 0.1  # of a flat picture's part of a fisheye's, and of that its overlap
 COLUMNS = 8  # flat pictures around the horizon, where one place sees all
 OVERSAMPLING = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
 BORDER_PIXELS = 2  # pixels around what is read of a flat picture
@@ -47,6 +49,7 @@ MIN_WIDTH, MAX_WIDTH = 64, 16_384  # pixels
 
 Vector = tuple[float, float, float]
 Point = Float[Tensor, " 3"]  # or a direction, in the scene's frame
+Lines = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # rows or columns of a picture, and their weights
 
 
 def export_panorama(loaded: Loaded, path: Path, options: SphereOptions = SphereOptions()) -> str:
@@ -98,22 +101,41 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
         tops = range(0, height, step)
         parts = [method.render(rows_of(camera, top, min(step, height - top))) for top in track(tops, name, len(tops))]
         return Rendering.cat([Rendering(x.rgb.cpu(), x.depth.cpu(), x.opacity.cpu()) for x in parts])
-    if columns is not None:
-        return by_flat_pictures(method, camera, columns, 0, name)
-    return by_flat_pictures(method, camera, -(-width // COLUMNS), width // (4 * COLUMNS), name)
+    lap, each = (width // (4 * COLUMNS), -(-width // COLUMNS)) if columns is None else (0, columns)
+    strips = [fading(x, min(x + each, width), lap, -lap, width + lap) for x in range(0, width, each)]
+    return by_flat_pictures(method, camera, divided(height, BANDS, lap), strips, name)
 
 
-def by_flat_pictures(method: Method, camera: Camera, columns: int, lap: int, name: str) -> Rendering:
-    """The sphere from flat pictures of a few columns and a band of rows; exact where their rays share an origin.
+@at_work()
+def through_lens(method: Method, camera: Camera) -> Rendering:
+    """Rendering of a camera whose lens has no flat picture, such as a fisheye's, for methods that have no other."""
+    method.eval()
+    width, height = camera.size[0].tolist()
+    ask_for_picture(width, height, method.device)
+    rim = torch.tensor([[0, height / 2], [width, height / 2], [width / 2, 0], [width / 2, height]])
+    left, right, top, bottom = camera.lens.unproject(rim)
+    axis = camera.lens.unproject(rim.mean(0, keepdim=True))[0]
+    across, down = (sum(float((axis @ x).clamp(-1, 1).acos()) for x in pair) for pair in ((left, right), (top, bottom)))
+    columns, rows = (max(1, math.ceil(angle / PATCH_ANGLE)) for angle in (across, down))
+    lap = int(LAP_SHARE * min(width / columns, height / rows))
+    strips, bands = divided(width, columns, lap), divided(height, rows, lap)
+    return by_flat_pictures(method, camera, bands, strips, "Through its lens")
 
-    lap: overlap in pixels, where pictures are cross-faded, since the order of Gaussians differs between them
-    """
+
+def divided(size: int, count: int, lap: int) -> list[Lines]:
+    """Parts of a picture's rows or columns, which overlap; nothing fades at its rim."""
+    edges = [-math.inf, *(round(size * i / count) for i in range(1, count)), math.inf]
+    return [fading(begin, end, lap, 0, size) for begin, end in pairwise(edges)]
+
+
+def by_flat_pictures(
+    method: Method, camera: Camera, bands: Sequence[Lines], strips: Sequence[Lines], name: str
+) -> Rendering:
+    """A picture from flat ones, each of some columns and a band of rows; exact where their rays share an origin. They
+    are cross-faded where they overlap, since the order of Gaussians differs between them."""
     width, height = camera.size[0].tolist()
     rgb, opacity, total = torch.zeros(height, width, 3), torch.zeros(height, width), torch.zeros(height, width)
     depth = torch.empty(height, width)
-    edges = [-math.inf, *(round(height * i / BANDS) for i in range(1, BANDS)), math.inf]  # nothing fades at the poles
-    bands = [fading(top, bottom, lap, 0, height) for top, bottom in pairwise(edges)]
-    strips = [fading(x, min(x + columns, width), lap, -lap, width + lap) for x in range(0, width, columns)]
     patches = [(band, strip) for strip in strips for band in bands]
     for (rows, low), (some, across) in track(patches, name, len(patches)):
         y, x = torch.meshgrid(rows, some, indexing="ij")
@@ -128,9 +150,7 @@ def by_flat_pictures(method: Method, camera: Camera, columns: int, lap: int, nam
     return Rendering(rgb / total[..., None], depth, opacity / total)
 
 
-def fading(
-    begin: float, end: float, lap: int, first: int, last: int
-) -> tuple[Int[Tensor, " pixel"], Float[Tensor, " pixel"]]:
+def fading(begin: float, end: float, lap: int, first: int, last: int) -> Lines:
     """Pixels among [first, last) that a patch reaches, and their weights: half at the patch's edges."""
     pixels = torch.arange(max(first, begin - lap), min(last, end + lap)).long()
     inside = torch.minimum(pixels + 0.5 - begin, end - pixels - 0.5)  # pixels from the nearer edge
@@ -138,16 +158,20 @@ def fading(
 
 
 def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
-    """A pinhole camera for some neighbouring pixels of a sphere, and their positions in its picture.
+    """A pinhole camera for some neighbouring pixels of a picture, and their positions in its own.
 
     Its position is the origin of the central ray.
     """
-    assert isinstance(camera.lens, Equirectangular)
-    middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
-    z = camera.lens.unproject(middle)[0]
-    turn = look_at(torch.zeros(3), z, torch.tensor([0.0, -1.0, 0.0]))[:, :3]  # level
-    directions = camera.lens.unproject(pixels) @ turn
-    focal = OVERSAMPLING * camera.lens.size[0, 0] / (2 * math.pi)
+    lens, middle = camera.lens, (pixels.amin(0) + pixels.amax(0))[None] / 2
+    z = lens.unproject(middle)[0]
+    turn = look_at(torch.zeros(3), z, torch.tensor([0.0, -1.0, 0.0] if z[1].abs() < 0.99 else [0.0, 0.0, 1.0]))[:, :3]
+    directions = lens.unproject(pixels) @ turn
+    per_radian = (
+        lens.size[0, 0] / (2 * math.pi)
+        if isinstance(lens, Equirectangular)
+        else (lens.solid_angle(middle, z[None]).rsqrt()[0])
+    )
+    focal = OVERSAMPLING * per_radian
     at = focal * directions[:, :2] / directions[:, 2:]
     low, high = at.amin(0), at.amax(0)
     corner = BORDER_PIXELS + 0.5 - low.floor()  # the axis goes through a pixel's centre

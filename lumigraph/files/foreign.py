@@ -45,7 +45,7 @@ POSES = {  # by name in a folder: a word of its first kilobytes, whose poses, th
     "*.db": ("SQLite", "COLMAP, without a model", "run COLMAP's mapper, which writes sparse/0"),
     "meta_data.json": ("", "SDFStudio", "write transforms.json as nerfstudio does, from its camtoworld and intrinsics"),
     "*.json": ('"transform_matrix"', "instant-ngp or nerfstudio under another name", "name the file transforms.json"),
-    "pose/*.txt": ("", "NSVF", "write transforms.json as nerfstudio does, from its matrices and intrinsics.txt"),
+    "pose/*.txt": ("", "NSVF without pictures or a camera", "put those in rgb/, and f cx cy into intrinsics.txt"),
     "cameras*.npz": ("", "IDR or NeuS", "write transforms.json as nerfstudio does, from its world_mat and scale_mat"),
     "cams/*_cam.txt": ("extrinsic", "MVSNet", COLMAP_EXPORT),
     "cameras.json": ("", "3D Gaussian splatting's output", "name the folder that it learnt from, or its .ply"),

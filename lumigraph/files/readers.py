@@ -22,6 +22,7 @@ READERS = (
     "rig",
     "colmap",
     "llff",
+    "nsvf",
     "light_field",
     "recording",
     "minecraft",

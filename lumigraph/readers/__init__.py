@@ -24,7 +24,7 @@ from .part import CapturePart as CapturePart
 from .part import Places as Places
 from .part import places_of as places_of
 from .pictures import list_images
-from .surveyed import CLOUD_SUFFIXES, OTHER_CLOUDS, describe_cloud
+from .surveyed import describe_cloud, is_cloud
 from .unposed import Unposed as Unposed
 from .views import multiscale as multiscale
 
@@ -41,7 +41,7 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     """The reader that recognises a folder. Raises LumigraphError if none does."""
     if not exists(folder):
         raise LumigraphError(f"{folder} does not exist; check the path")
-    if folder.suffix.lower() in (*CLOUD_SUFFIXES, *OTHER_CLOUDS) and not folder.is_dir():
+    if is_cloud(folder):
         raise LumigraphError(describe_cloud(folder))
     if not folder.is_dir():
         raise LumigraphError(

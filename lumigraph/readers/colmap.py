@@ -14,6 +14,7 @@ import torch
 
 from ..camera.lens import (
     Division,
+    EnhancedUnified,
     Equirectangular,
     FieldOfView,
     Fisheye,
@@ -50,7 +51,7 @@ ALIKE = {  # lenses here that take COLMAP's coefficients in its order
     "DIVISION": Division,
     "RAD_TAN_THIN_PRISM_FISHEYE": RadialThinPrism,
 }
-THIN_PRISM = "THIN_PRISM_FISHEYE"
+THIN_PRISM, ENHANCED = "THIN_PRISM_FISHEYE", "EUCM"
 PRISM_ORDER = [0, 1, 4, 5, 2, 3, 6, 7]  # of its k1 k2 p1 p2 k3 k4 sx1 sy1, for the lens here
 FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
@@ -303,7 +304,7 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
         )
     if kind == "EQUIRECTANGULAR":
         return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
-    if kind not in (*PLANAR, *FISHEYE, *ALIKE, THIN_PRISM):
+    if kind not in (*PLANAR, *FISHEYE, *ALIKE, THIN_PRISM, ENHANCED):
         raise LumigraphError(
             f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
             f"run COLMAP's image_undistorter and use its folder"
@@ -313,6 +314,8 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     focal = focal.expand(1, 2).contiguous()
     if kind == THIN_PRISM:
         return ThinPrism(focal, centre, bends[:, PRISM_ORDER])
+    if kind == ENHANCED:
+        return EnhancedUnified(focal, centre, *bends.split(1, 1))
     if kind in ALIKE:
         return ALIKE[kind](focal, centre, bends)
     if kind in FISHEYE:

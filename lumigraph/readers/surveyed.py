@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import subprocess
 import tempfile
@@ -23,6 +25,7 @@ from ..camera import Camera
 from ..camera.lens import Lens, Pinhole
 from ..depth_maps import back_project
 from ..errors import LumigraphError
+from ..files import explained
 from ..files.reading import reads
 from ..geometry import evenly
 from ..system.children import start_python
@@ -33,6 +36,8 @@ from .pictures import stat, upright_size
 
 CLOUD_SUFFIXES = (".las", ".laz", ".e57")
 OTHER_CLOUDS = (".pcd", ".xyz", ".pts", ".ptx", ".asc")  # that are known by name and not read
+TABLES = (".txt", ".csv", ".dat")  # that may be clouds
+CLOUD_COLUMNS = (3, 4, 6, 7, 9, 10)  # of positions, and maybe an intensity, a colour, a normal
 SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
 WORKER = Path(__file__).with_name("cloud_worker.py")
@@ -44,6 +49,7 @@ FEW_THREADS = {
     "RUST_BACKTRACE": "0",
 }  # each thread reserves addresses
 LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
+PROBED, MIN_LINES = 4096, 8  # characters of a table, and lines in them
 CELL = 3  # pixels along a square whose nearest point hides what is behind it
 HIDDEN = 0.03  # of the distance of the nearest point around, behind which a point is hidden
 SLOPE = 4.0  # tangent of the angle up to which a slanted surface does not hide itself
@@ -76,10 +82,22 @@ def with_surveyed(capture: Capture, path: Path) -> Capture:
     return replace(capture, shots=[with_depth(shot) for shot in capture.shots])
 
 
+def is_cloud(path: Path) -> bool:
+    """True for a file of points by its name, and for a table of numbers that may be points."""
+    if path.is_dir() or path.suffix.lower() not in TABLES:
+        return path.suffix.lower() in (*CLOUD_SUFFIXES, *OTHER_CLOUDS) and not path.is_dir()
+    with explained(path), open(path, encoding="utf-8", errors="replace") as opened:
+        _, *lines = opened.read(PROBED).splitlines()[:-1] or [""]  # after a line of titles, and not the cut one
+    with contextlib.suppress(ValueError):
+        widths = {len([float(x) for x in re.split(r"[,;\s]+", line.strip())]) for line in lines}
+        return len(lines) >= MIN_LINES and len(widths) == 1 and widths <= {*CLOUD_COLUMNS}
+    return False
+
+
 def describe_cloud(path: Path) -> str:
     """Sentence on a cloud of points that is named where photographs are needed. Raises LumigraphError for a damaged
     one."""
-    if path.suffix.lower() in OTHER_CLOUDS:
+    if path.suffix.lower() not in CLOUD_SUFFIXES:
         return (
             f"{path} is a cloud of points without photographs; convert it to .las or .ply, and it gives depth to "
             "photographs with poses: lumigraph train METHOD SCENE --depth-from FILE"

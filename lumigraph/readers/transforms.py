@@ -121,6 +121,7 @@ class Posed:
     is_fisheye: bool | float | None = None
     fl_x: Focal | None = None
     fl_y: Focal | None = None
+    intrinsic_matrix: list[Row] | None = None
     camera_angle_x: Angle | None = None
     camera_angle_y: Angle | None = None
     x_fov: Degrees | None = None
@@ -356,6 +357,10 @@ def read_pose(about: Posed, where: str) -> np.ndarray:
 def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     width, height = size
     model = model_of(about)
+    if about.intrinsic_matrix is not None and about.fl_x is None:
+        with reading(where, "has an intrinsic_matrix that is not 3x3 or more", "correct it"):
+            (fx, _, cx), (_, fy, cy) = (line[:3] for line in about.intrinsic_matrix[:2])
+        about = replace(about, fl_x=fx, fl_y=fy, cx=cx, cy=cy)
     if model in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Equirectangular(row(width, height))
     if model not in (*WITHOUT_BENDS, *WITH_BENDS, *FISHEYES):
