@@ -1,19 +1,23 @@
-"""How like our own renderings a page of a volume is, and how long it draws a picture.
+"""How like our own renderings a page of splats or of a volume is, and how long it draws a picture.
 
     lumigraph export web RUN scene.html
     python benchmarks/pages.py RUN scene.html --output pages
 
 Opens the page in a headless Chromium, which draws in software unless --webgl gives other switches. For some of the
-run's cameras, at 400x400 pixels: PSNR of a screenshot against `Method.render`, and the milliseconds that a picture
-takes to draw in full, all its bands together. Writes both pictures beside each other with four times their
+run's cameras, at 400x400 pixels: PSNR of a screenshot against `Method.render`, and the milliseconds that a volume's
+picture takes to draw in full, all its bands together. Writes both pictures beside each other with four times their
 difference, and what the page shows at first at a desktop's and at a phone's size; and frames per second there while
-the scene turns.
+the scene turns. Bytes of the programs in the page are told before and after unpacking, and seconds to the first
+picture and to the whole one at a desktop's size.
 """
 
 from __future__ import annotations
 
+import base64
+import gzip
 import io
 import math
+import re
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,18 +87,32 @@ def main(options: Options) -> None:
         for i in evenly(range(len(some)), options.views):
             found.append(compared(page, method, square(some[i]), options.output / f"{options.page.stem}-{i}.png"))
             print(found[-1], flush=True)
-        turning = {}
+        turning, opening = {}, {}
         for name, window in WINDOWS.items():
-            shown, _ = visited(browser, options.page, *window)
+            shown, first = visited(browser, options.page, *window)
+            begin = time.perf_counter()
             shown.evaluate("lumigraph.rest()")
+            opening[name] = [round(first, 2), round(first + time.perf_counter() - begin, 2)]
             shown.screenshot(path=options.output / f"{options.page.stem}-{name}.png")
             turning[name] = round(shown.evaluate(TURN, TURNED), 1)
             shown.close()
         browser.close()
     about = {"page": options.page.name, "megabytes": options.page.stat().st_size / 1e6, "seconds_to_open": loading}
-    about["frames_per_second"] = turning
+    about |= {
+        "frames_per_second": turning,
+        "seconds_to_first_and_whole": opening,
+        "program_kilobytes": programs(options),
+    }
     write_json(options.output / f"{options.page.stem}.json", about | {"views": found})
     print(about)
+
+
+def programs(options: Options) -> list[float]:
+    """Kilobytes of the programs in the page, packed and unpacked."""
+    found = re.search(r'<script id="program"[^>]*>([^<]*)<', options.page.read_text("utf-8"))
+    assert found, f"{options.page} has no program"
+    packed = base64.b64decode(found[1])
+    return [round(len(data) / 1e3, 1) for data in (packed, gzip.decompress(packed))]
 
 
 def visited(browser: Any, path: Path, width: int, height: int, density: int) -> tuple[Any, float]:

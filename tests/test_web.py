@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import gzip
+import http.server
+import io
 import json
 import math
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from budgets import budget
+from PIL import Image
 from tiny import method as tiny_method
 from tiny import new_run, scene
 from windows import SIZE, psnr, some_camera
@@ -19,8 +25,10 @@ from windows import SIZE, psnr, some_camera
 from lumigraph.camera import Camera
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
+from lumigraph.exchange import write_gaussians
+from lumigraph.exchange.streamed_sog import Detail
 from lumigraph.export.options import PageOptions
-from lumigraph.export.page import WEB, mesh_page, splats_page, views, views_page
+from lumigraph.export.page import WEB, contributions, mesh_page, splats_page, streamed_page, views, views_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render
 from lumigraph.paths import Surroundings
@@ -65,6 +73,51 @@ def test_splats_are_drawn_as_we_draw_them(tmp_path, window, antialiased):
             dataclasses.replace(made, harmonics=made.harmonics[:, :1]), camera, OPENING.background, OPENING.near
         ).rgb.clamp(0, 1)
         assert psnr(shown, without.numpy()) < 30  # the harmonics are seen
+
+
+def test_a_budget_draws_the_largest_contributions(tmp_path, window):
+    made = cloud()
+    splats_page(tmp_path / "page.html", made, OPENING, budget=150)
+    largest = made[contributions(made).argsort(descending=True)[:150]]
+    camera = some_camera()
+    shown = window(tmp_path / "page.html").look(camera)
+    ours = [render(some, camera, OPENING.background, OPENING.near).rgb.clamp(0, 1).numpy() for some in (largest, made)]
+    assert psnr(shown, ours[0]) > 42 and psnr(shown, ours[1]) < 35
+
+
+def test_levels_of_detail_are_loaded(tmp_path, page, faults):
+    """The coarsest level opens the page, and the finest is there a little later, turned as the page says."""
+    made = cloud()
+    turn = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    meta = tmp_path / "a scene" / "lod-meta.json"
+    write_gaussians(meta, made.transformed(turn.inverse()), Detail(levels=2, chunk=1024))
+    streamed_page(tmp_path / "page.html", meta, turn, OPENING)
+    handler = functools.partial(QuietHandler, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page.set_viewport_size({"width": SIZE, "height": SIZE})
+        page.goto(f"http://127.0.0.1:{server.server_port}/page.html")
+        page.evaluate("lumigraph.ready")
+        page.add_style_tag(
+            content="#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
+        )
+        camera = some_camera(4)
+        ours = render(made, camera, OPENING.background, OPENING.near).rgb.clamp(0, 1).numpy()
+        for _ in range(100):
+            page.evaluate("([pose, angle]) => lumigraph.setCamera(pose, angle)", [camera.pose[0].tolist(), 45.0])
+            shown = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
+            if psnr(shown, ours) > 38:
+                break
+            page.wait_for_timeout(50)
+        else:
+            pytest.fail(f"the finest level differs: {psnr(shown, ours):.1f} dB")
+        server.shutdown()
+    assert faults == []
+
+
+class QuietHandler(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
 
 
 def test_turning_and_going_back(tmp_path, window):
@@ -251,6 +304,8 @@ def test_the_command(run, tmp_path, capsys):
         (["page.html", "--size", "3"], "--size"),
         (["page.html", "--as", "splats"], "no Gaussians"),
         (["page.html", "--background", "red"], "--background"),
+        (["page.html", "--budget", "many"], "--budget"),
+        (["page.html", "--stream"], "--stream"),
     ],
 )
 def test_what_cannot_be_is_refused(run, tmp_path, capsys, arguments, told):
@@ -270,7 +325,7 @@ def test_titles_cannot_break_a_page(tmp_path):
 def test_programs_name_the_versions_that_are_pinned():
     pinned = json.loads(PACKAGES.read_text("utf-8"))["dependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in pinned.values())
-    for program, names in {"stage": ["three"], "splats": ["@sparkjsdev/spark"]}.items():
+    for program, names in {"stage": ["three"]}.items():
         heading = (WEB / f"{program}.js").read_text("utf-8")[:20_000]
         for name in names:
             assert f"{name} {pinned[name]}" in heading
@@ -280,6 +335,12 @@ def test_programs_name_the_versions_that_are_pinned():
 def test_three_js_is_bundled_once():
     holders = [path.name for path in WEB.glob("*.js") if "THREE.WebGLRenderer" in path.read_text("utf-8")]
     assert holders == ["stage.js"]
+
+
+def test_the_programs_of_a_page_are_small():
+    """Under a megabyte, and under 350 kB as pages hold them."""
+    held = b"".join((WEB / f"{name}.js").read_bytes() for name in ("stage", "splats"))
+    assert len(held) < 1e6 and len(gzip.compress(held, 9)) < 350e3
 
 
 def test_the_lock_names_no_registry():

@@ -11,12 +11,6 @@ const built = (name) => here(`../lumigraph/export/web/${name}.js`);
 const own = JSON.parse(await readFile(here("package.json")));
 const shown = "Built from web/ by `npm ci && npm run build`. Do not edit.";
 
-// What Spark's WebAssembly is made of, as the paths inside it tell; all of it is MIT, Zlib, or MIT or Apache-2.0.
-const CRATES =
-  "Inside Spark's WebAssembly, under the MIT, Apache-2.0 or Zlib licence: anyhow, console_error_panic_hook, fdeflate, " +
-  "hashbrown, image, image-webp, indexmap, js-sys, memchr, miniz_oxide, png, serde, serde_json, serde-wasm-bindgen, " +
-  "smallvec, wasm-bindgen, zip, zlib-rs.";
-
 async function notice(name) {
   const about = JSON.parse(await readFile(here(`node_modules/${name}/package.json`)));
   const licence = await readFile(here(`node_modules/${name}/LICENSE`), "utf8");
@@ -26,7 +20,6 @@ async function notice(name) {
 async function bundle(name, parts, options) {
   const pinned = parts.filter((part) => own.dependencies[part]).map((part) => `${part} ${own.dependencies[part]}`);
   const notices = await Promise.all(parts.map(notice));
-  if (parts.includes("@sparkjsdev/spark")) notices.push(CRATES);
   const heading = ["Lumigraph's page program", ...pinned].join(" · ");
   await build({
     outfile: built(name),
@@ -53,7 +46,7 @@ const fromStage = {
 
 let programs = "";
 for (const [name, parts] of [
-  ["splats", ["@sparkjsdev/spark", "fflate"]],
+  ["splats", []],
   ["mesh", []],
   ["volumes", []],
   ["views", []],

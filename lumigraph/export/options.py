@@ -335,6 +335,10 @@ class PageOptions:
     """Training time of the octree that a field is converted to, in seconds."""
     duration: Annotated[Seconds | None, option("SECONDS", DURATION_TEXT)] = None
     """Time that a capture of moving splats takes when it is played; longer is slower."""
+    budget: Annotated[str, option("N", "auto: 1 M on phones, 3 M elsewhere")] = "auto"
+    """Largest number of splats drawn, those that contribute most; a smaller one is faster and shows less detail."""
+    stream: bool = False
+    """Write splats as levels of detail in a folder beside the page, loaded over HTTP as the camera needs them."""
 
 
 @dataclass(frozen=True)

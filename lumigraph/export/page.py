@@ -2,7 +2,7 @@
 with a backdrop: colours of unobserved directions, from the scene's own, and the floor as camera limit.
 
 The programs in web/ are built from the folder `web` of the repository. Pages with WebGL have stage.js (three.js, camera
-and controls) before their own program; that of clouds has Spark. Programs and data are compressed in the page.
+and controls) before their own program. Programs and data are compressed in the page.
 """
 
 import base64
@@ -17,6 +17,7 @@ from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from .. import __version__
 from ..camera import Camera
 from ..datasets.mesh import Mesh
 from ..errors import LumigraphError
-from ..exchange import spz
+from ..exchange import claim_splats, spz, streamed_sog, write_gaussians
 from ..exchange.baked import Browsable, atlas_for_browser, octree_for_browser
 from ..exchange.codes import TURN_MEAN
 from ..figures import hex_colour, to_bytes
@@ -116,13 +117,35 @@ LOOK_HELP = "Drag to look around", "Drag to look around"
 PARALLAX_HELP = "Move the mouse to look behind things", "Tilt the phone, or drag, to look behind things"
 
 
-def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
-    """Write a page that renders a cloud in the scene's frame as splats with harmonics, stored as .spz, with its
-    loss."""
-    settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
+def splats_page(path: Path, gaussians: Gaussians, opening: Opening, budget: int | None = None) -> None:
+    """Write a page that renders a cloud in the scene's frame as splats with harmonics, stored as .spz, with its loss,
+    those with the largest contribution first. budget: Gaussians drawn at most; None for the device's"""
+    settings = asdict(opening) | {
+        "webgl": True,
+        "packed": False,
+        "antialiased": gaussians.antialiased,
+        "budget": budget,
+    }
     with counting(f"Packing {len(gaussians):,} Gaussians"):
-        packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
+        packed = spz.gzipped(gaussians[contributions(gaussians).argsort(descending=True)], steps=HARMONICS_STEPS)
     write_bytes(path, page_bytes("splats", settings, packed), "page")
+
+
+def contributions(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
+    """Opacity times the area of the largest cross-section, in the frame's units squared, up to a factor."""
+    return gaussians.opacities.sigmoid() * gaussians.log_scales.topk(2).values.sum(-1).exp()
+
+
+def streamed_page(
+    path: Path, meta: Path, to_scene: Float[Tensor, "4 4"], opening: Opening, budget: int | None = None
+) -> None:
+    """Write a page that loads a streamed SOG over HTTP, the coarsest level first, then those that its camera needs.
+
+    meta: lod-meta.json, in the page's folder or below. to_scene: similarity from the frame of its files
+    """
+    name = quote(meta.resolve().relative_to(path.resolve().parent).as_posix())
+    settings = {"webgl": True, "packed": False, "stream": name, "placed": to_scene.flatten().tolist(), "budget": budget}
+    write_bytes(path, page_bytes("splats", asdict(opening) | settings, b""), "page")
 
 
 def moving_page(path: Path, moving: MovingGaussians, opening: Opening) -> None:
@@ -243,6 +266,7 @@ def page_bytes(program: str, settings: dict[str, Any], data: bytes, help_text: t
         "edge": edge,
         "mouse": mouse,
         "touch": touch,
+        "connect": " 'self'" if "stream" in settings else "",
         "settings": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
         "data": base64.b64encode(data).decode(),
         "program": base64.b64encode(gzip.compress(source, 9, mtime=0)).decode(),
@@ -266,7 +290,12 @@ def export_page(
     bakes:  whether it becomes an octree where the options leave the kind open
     Raises LumigraphError for options that it cannot have.
     """
-    background, cameras, kind = background_of(options), loaded.cameras["train"], kind_of(loaded, options, bakes)
+    background, budget = background_of(options), budget_of(options)
+    cameras, kind = loaded.cameras["train"], kind_of(loaded, options, bakes)
+    if options.stream and (kind != "splats" or loaded.moves):
+        raise LumigraphError("Only a cloud of Gaussians that stands still is streamed; leave out --stream")
+    if options.stream and streamed(loaded, path) is None:
+        claim_splats(path.with_suffix("") / streamed_sog.META)
     if kind == "volume" and loaded.part.crops:
         raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
     if kind == "volume" and octree is not None and not is_baked(loaded.method):
@@ -294,8 +323,32 @@ def export_page(
         held = f"{count:,} Gaussians that stand still, {spans:,} spans of those that move"
         return held, {"still": count, "moving": spans}
     gaussians = loaded.gaussians()
-    splats_page(path, gaussians, opening)
+    if options.stream:
+        meta = streamed(loaded, path)
+        to_scene = loaded.frame.to_source.inverse.matrix
+        if meta is None:
+            meta, to_scene = path.with_suffix("") / streamed_sog.META, torch.eye(4)
+            write_gaussians(meta, gaussians)
+        streamed_page(path, meta, to_scene, opening, budget)
+    else:
+        splats_page(path, gaussians, opening, budget)
     return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}", {"gaussians": len(gaussians)}
+
+
+def streamed(loaded: Loaded, path: Path) -> Path | None:
+    """lod-meta.json of what is loaded, if a page at `path` can load it as it is; None otherwise."""
+    meta = loaded.opened.path / streamed_sog.META if loaded.opened.path.is_dir() else loaded.opened.path
+    whole = meta.name == streamed_sog.META and not (loaded.part.crops or loaded.part.removes)
+    return meta if whole and meta.resolve().is_relative_to(path.resolve().parent) else None
+
+
+def budget_of(options: PageOptions) -> int | None:
+    """Gaussians of --budget; None for auto. Raises LumigraphError for what is no number of them."""
+    if options.budget == "auto":
+        return None
+    if not options.budget.isdecimal() or not int(options.budget):
+        raise LumigraphError(f"{options.budget!r} is no budget; give --budget auto, or a number of Gaussians")
+    return int(options.budget)
 
 
 def kind_of(loaded: Loaded, options: PageOptions, bakes: bool) -> str:

@@ -1,47 +1,22 @@
 // Gaussians of spans of time: where each is at a moment, and whether it is there. See lumigraph/gaussians/moving.py.
 
-import { dyno } from "@sparkjsdev/spark";
-import { DataTexture, FloatType, NearestFilter, RGBAFormat } from "three";
-
-const WIDTH = 2048; // texels of a row; two for each Gaussian
 const HALVES = 3, SINGLES = 4; // numbers of each Gaussian: velocity in 16 bits; middle, begin, end and 1 / fade in 32
 
-// data: of `count` Gaussians, one number after another. Returns a modifier of a SplatMesh and its clock in seconds.
-export function motion(data, count) {
-  const singles = new Float32Array(data, 0, SINGLES * count);
+// data: of `count` Gaussians, one number after another. Returns texels for the graphics, whole rows of them, and the spans
+// for the sorter.
+export function motion(data, count, row) {
+  const [middles, begins, ends, sharpness] = [0, 1, 2, 3].map((k) => new Float32Array(data, 4 * k * count, count));
   const halves = new Uint16Array(data, 4 * SINGLES * count, HALVES * count);
-  const height = Math.max(1, Math.ceil((2 * count) / WIDTH));
-  const texels = new Float32Array(4 * WIDTH * height);
+  const texels = new Uint32Array(4 * row * Math.ceil(count / row)), floats = new Float32Array(texels.buffer);
+  const velocities = new Float32Array(HALVES * count);
   for (let i = 0; i < count; i++) {
-    for (let k = 0; k < 3; k++) texels[8 * i + k] = single(halves[k * count + i]);
-    for (let k = 0; k < 4; k++) texels[8 * i + 3 + k] = singles[k * count + i];
+    for (let k = 0; k < HALVES; k++) velocities[HALVES * i + k] = single(halves[k * count + i]);
+    texels[4 * i] = halves[i] | (halves[count + i] << 16);
+    texels[4 * i + 1] = halves[2 * count + i];
+    floats[4 * i + 2] = middles[i];
+    floats[4 * i + 3] = sharpness[i];
   }
-  const texture = new DataTexture(texels, WIDTH, height, RGBAFormat, FloatType, undefined, undefined, undefined, NearestFilter, NearestFilter);
-  texture.needsUpdate = true;
-  const time = dyno.dynoFloat(0);
-  const table = dyno.dynoSampler2D(texture);
-  const modifier = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
-    const moved = new dyno.Dyno({
-      inTypes: { gsplat: dyno.Gsplat, time: "float", table: "sampler2D" },
-      outTypes: { gsplat: dyno.Gsplat },
-      inputs: { gsplat, time, table },
-      statements: ({ inputs, outputs }) => [
-        `{`,
-        `  ${outputs.gsplat} = ${inputs.gsplat};`,
-        `  int at = 2 * ${inputs.gsplat}.index;`,
-        `  vec4 first = texelFetch(${inputs.table}, ivec2(at % ${WIDTH}, at / ${WIDTH}), 0);`,
-        `  vec4 second = texelFetch(${inputs.table}, ivec2((at + 1) % ${WIDTH}, (at + 1) / ${WIDTH}), 0);`,
-        `  float away = ${inputs.time} - first.w;`,
-        `  ${outputs.gsplat}.center += away * first.xyz;`,
-        `  float seen = exp(-0.5 * away * away * second.z * second.z);`,
-        `  bool there = second.x <= ${inputs.time} && ${inputs.time} < second.y;`,
-        `  ${outputs.gsplat}.rgba.a *= there ? seen : 0.0;`,
-        `}`,
-      ],
-    });
-    return { gsplat: moved.outputs.gsplat };
-  });
-  return { modifier, time };
+  return { texels, spans: { begins, ends, middles, velocities } };
 }
 
 // A number of 16 bits, as IEEE 754 has it.

@@ -1,80 +1,86 @@
-// A cloud of Gaussians, drawn by Spark as Lumigraph draws it: blended in sRGB, cut where it adds less than 1/255.
+// A cloud of Gaussians: still, moving, or in levels of detail that are loaded as they are needed.
 
-import { ExtSplats, SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
-import { packAgain } from "./harmonics.js";
+import { Matrix4 } from "three";
 import { clock, motion } from "./motion.js";
+import { Cloud, ROW } from "./splats/cloud.js";
+import { levels } from "./splats/levels.js";
+import { Pace, budgetOf } from "./splats/pace.js";
+import { fromSpz } from "./splats/packed.js";
 import { Stage } from "./stage.js";
 
-const FAINTEST = 1 / 255;
-const BLUR = 0.3; // square pixels by which a footprint is widened
-
 export async function start(settings, held) {
-  const data = settings.splats ? held.slice(0, settings.splats) : held;
   const stage = new Stage(settings, { antialias: false });
-  const widened = settings.antialiased ? { blurAmount: BLUR, preBlurAmount: 0 } : { blurAmount: 0, preBlurAmount: BLUR };
-  const spark = new SparkRenderer({
-    renderer: stage.renderer,
-    maxStdDev: Math.sqrt(2 * Math.log(1 / FAINTEST)),
-    minAlpha: FAINTEST,
-    maxPixelRadius: 4096,
-    clipXY: 3,
-    sortRadial: false,
-    accumExtSplats: true,
-    enableLod: false,
-    onDirty: () => stage.redraw(),
-    ...widened,
-  });
-  asOurs(spark.material);
-  const unpacked = await inflated(data);
-  const cloud = new ExtSplats({ fileBytes: data, fileType: SplatFileType.SPZ });
-  await cloud.initialized;
-  packAgain(unpacked, cloud.extra);
-  const mesh = new SplatMesh({ extSplats: cloud });
-  mesh.quaternion.set(1, 0, 0, 0); // .spz has y up and z back: half a turn around x
-  stage.scene.add(spark, mesh);
-  const moves = settings.splats ? motion(await inflated(held.slice(settings.splats)), cloud.numSplats) : null;
-  if (moves) mesh.objectModifier = moves.modifier;
-  await mesh.initialized;
-  stage.sorted = async () => {
-    while (spark.sorting || spark.sortDirty) await new Promise((resolve) => setTimeout(resolve, 5));
-  };
-  stage.arranged = async () => {
-    await stage.sorted(); // for another camera, perhaps
-    await spark.update({ scene: stage.scene, camera: stage.camera });
-    await stage.sorted();
-  };
+  const { gl, budget } = limits(stage, settings);
+  if (settings.stream) {
+    const { cloud, select } = await levels(stage, settings, budget);
+    await shown(stage, cloud, select, gl);
+    return stage;
+  }
+  const made = fromSpz(await inflated(settings.splats ? held.slice(0, settings.splats) : held));
+  const moves = settings.splats ? motion(await inflated(held.slice(settings.splats)), made.count, ROW) : null;
+  const placed = new Matrix4().makeScale(1, -1, -1); // .spz has y up and z back: half a turn around x
+  const cloud = new Cloud(stage, { ...made, capacity: made.count, antialiased: settings.antialiased, placed, moves });
+  cloud.hold(0, made);
+  const most = moves ? made.count : Math.min(budget, made.count);
+  // Those with the largest contribution are first, except in clouds that move, of which few are there at a time.
+  const pace = await shown(stage, cloud, (share) => [[0, moves ? most : Math.ceil(share * most)]], gl);
   if (moves) {
     stage.setTime = async (seconds) => {
-      moves.time.value = Math.min(seconds, settings.duration * (1 - 1e-6)); // spans end before their ends
-      mesh.updateVersion();
-      await stage.arranged();
+      pace.moving = true;
+      cloud.choose(cloud.ranges, Math.min(seconds, settings.duration * (1 - 1e-6))); // spans end before their ends
+      await cloud.arrange();
       stage.redraw();
     };
     stage.seek = clock(stage, settings.duration);
-    await stage.seek(0);
   }
-  stage.camera.updateMatrixWorld();
-  await stage.arranged();
-  stage.redraw();
   return stage;
+}
+
+function limits(stage, settings) {
+  const gl = stage.renderer.getContext();
+  return { gl, budget: Math.min(budgetOf(settings), ROW * gl.getParameter(gl.MAX_TEXTURE_SIZE)) };
+}
+
+// Has the stage paint a cloud: what is there in the order of before, and again once that of the new camera is found.
+// select(share): the ranges to draw, of so large a share of the budget. Resolves once there is a picture.
+async function shown(stage, cloud, select, gl) {
+  const { paint, camera } = stage, seen = new Matrix4();
+  const pace = new Pace(async () => {
+    await stage.arranged();
+    stage.paint();
+  });
+  stage.arranged = async () => {
+    pace.moving = false;
+    camera.updateMatrixWorld();
+    seen.copy(camera.matrixWorld);
+    cloud.choose(select(1));
+    while (await cloud.arrange());
+  };
+  stage.sorted = async () => {
+    while (cloud.sorting) await cloud.sorting;
+  };
+  stage.paint = () => {
+    camera.updateMatrixWorld();
+    if (!seen.equals(camera.matrixWorld)) pace.moving = true;
+    seen.copy(camera.matrixWorld);
+    cloud.choose(select(pace.share));
+    const again = () => !cloud.sorting && cloud.arrange().then((found) => found && stage.redraw());
+    if (cloud.count > 2 * cloud.chosen) return again(); // the picture of before stays until there are fewer
+    paint();
+    cloud.paint(pace.scale);
+    again();
+    if (!pace.moving) return;
+    const sharpening = pace.follow().finally(() => stage.sharpening === sharpening && (stage.sharpening = null));
+    stage.sharpening = sharpening;
+  };
+  await stage.arranged();
+  stage.paint();
+  const begin = performance.now();
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until it is drawn
+  pace.learn(performance.now() - begin);
+  return pace;
 }
 
 function inflated(bytes) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
-}
-
-// Three differences between Spark's shaders and Kerbl's: colours are never taken for linear, no Gaussian hides more than
-// 0.99, and beyond the picture's edge the projection's slope stays that of its margin, 0.15 of the picture.
-function asOurs(material) {
-  const replace = (source, from, to) => {
-    if (!source.includes(from)) throw new Error(`Spark's shader has no ${from}`);
-    return source.replace(from, to);
-  };
-  material.fragmentShader = replace(material.fragmentShader, "if (encodeLinear) {", "rgba.a = min(rgba.a, 0.99); if (false) {");
-  material.vertexShader = replace(
-    material.vertexShader,
-    "vec2 J2 = -(J1 * viewCenter.xy) * invZ;",
-    `vec2 plane = viewCenter.xy * invZ, edge = 1.3 / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
-    vec2 J2 = -J1 * clamp(plane, -edge, edge);`,
-  );
 }
