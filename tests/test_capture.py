@@ -36,7 +36,7 @@ from lumigraph.camera.rays import Rays
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.opening import open_scene
-from lumigraph.readers import Capture, Shot, assemble, choose_reader
+from lumigraph.readers import Capture, Shot, assemble, choose_reader, colmap
 from lumigraph.readers.hull import farthest
 from lumigraph.readers.normalise import power_of_two
 from lumigraph.readers.points import similarity
@@ -817,9 +817,14 @@ def test_colmap_images_that_are_elsewhere(tiny, tmp_path):
     refuse(tmp_path, "none of the 10 photographs", "view_00.png")
 
 
-def test_colmap_lenses_nobody_follows(tiny, tmp_path):
-    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 0.5, 1.0])
-    refuse(write_colmap(tmp_path, tiny, cameras=[camera]), "EUCM", "image_undistorter")
+def test_colmap_lenses_nobody_follows(tiny, tmp_path, monkeypatch):
+    """All models of the COLMAP that is installed are followed; one of a later COLMAP would be named."""
+    for name in set(pycolmap.CameraModelId.__members__) - {"INVALID"}:
+        colmap.read_lens(pycolmap.Camera.create_from_model_name(1, name, 60.0, WIDTH, HEIGHT), tmp_path)
+    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[60, 60, 24, 18, 1.5, 1.0])
+    refuse(write_colmap(tmp_path / "beyond", tiny, cameras=[camera]), "alpha is 1.5, which is not between 0 and 1")
+    monkeypatch.setattr(colmap, "PLANAR", ())
+    refuse(write_colmap(tmp_path / "new", tiny), "PINHOLE", "image_undistorter")
 
 
 def test_damaged_llff(tiny, tmp_path):
