@@ -36,6 +36,7 @@ from lumigraph.components.clouds.initialization import initial_cloud
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians.rasterization import matrices_of
 from lumigraph.gsplat import DefaultStrategy, DensitySteps, MCMCStrategy
+from lumigraph.metrics import psnr
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
@@ -261,7 +262,7 @@ def training(name: str, options: Options) -> Row:
         for i in scene.splits["test"].tolist():
             target = undistorted(i)
             picture, _, _ = seen(params, cameras[i : i + 1], Ks[i : i + 1], target, False)
-            scores.append(psnr(picture[0], target))
+            scores.append(psnr(picture[0].clamp(0, 1), target))
     return {"strategy": name, "steps": options.steps, "psnr": sum(scores) / len(scores), "views": len(scores),
             "gaussians": len(params["means"]), "seconds": seconds, "scene": options.data.name,
             "size": f"{target.shape[1]} x {target.shape[0]}"}  # fmt: skip
@@ -321,9 +322,12 @@ def own_loop(path: Path, options: Options, seed: int) -> Row:
         with torch.no_grad():
             truth = [(i, scene.photograph(i).before(beyond[0]), trusted(scene.photograph(i))) for i in test.tolist()]
             theirs = [
-                psnr(model.render(scene.cameras[i]).rgb[kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth
+                psnr(model.render(scene.cameras[i]).rgb[kept[..., 0]].clamp(0, 1), rgb[kept[..., 0]])
+                for i, rgb, kept in truth
             ]
-            ours = [psnr(picture(i, beyond, 3)[0][kept[..., 0]], rgb[kept[..., 0]]) for i, rgb, kept in truth]
+            ours = [
+                psnr(picture(i, beyond, 3)[0][kept[..., 0]].clamp(0, 1), rgb[kept[..., 0]]) for i, rgb, kept in truth
+            ]
     return {"scene": path.name, "steps": steps, "seed": seed, "own": sum(ours) / len(ours),
             "train": sum(theirs) / len(theirs), "gaussians": len(params["means"]), "views": len(ours)}  # fmt: skip
 
@@ -332,10 +336,6 @@ def trusted(photograph: Any) -> torch.Tensor:
     """Mask of the pixels that are learnt and compared, (height, width, 1)."""
     whole = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool)
     return (whole if photograph.mask is None else photograph.mask)[..., None]
-
-
-def psnr(picture: torch.Tensor, target: torch.Tensor) -> float:
-    return float(-10 * (picture.clamp(0, 1) - target).square().mean().log10())
 
 
 def seen(params: Any, viewmats: Any, Ks: Any, target: Any, absolute: bool) -> tuple[Any, Any, Any]:

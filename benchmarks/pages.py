@@ -1,4 +1,4 @@
-"""How like our own renderings a page of splats or of a volume is, and how long it draws a picture.
+"""Likeness of pages of splats and volumes to our own renderings, and seconds of a picture.
 
     lumigraph export web RUN scene.html
     python benchmarks/pages.py RUN scene.html --output pages

@@ -372,7 +372,7 @@ def test_seven_scenes(tiny, tmp_path):
 
 
 def test_pictures_poses_and_a_pinhole_in_text_files(tiny, tmp_path):
-    """Of SRN and NSVF, and of NeRF++, which has a camera for each picture and a folder for each split."""
+    """Layouts of SRN, of NSVF and of NeRF++, with a camera for each picture and a folder for each split."""
     scene = open_scene(write_nsvf(tmp_path / "nsvf", tiny))
     assert len(scene.splits["test"]) == len(tiny.poses) // 2 and scene.names[0].startswith("rgb/0_")
     plus = write_nsvf(tmp_path / "plus", tiny, split=False)

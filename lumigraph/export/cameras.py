@@ -50,11 +50,11 @@ def pictures(method: Method, cameras: Sequence[Camera]) -> Iterator[Rendering]:
 def picture_of(method: Method, camera: Camera) -> Rendering:
     """Rendering of one camera; by flat pictures where the method has none of its lens."""
     with at_work(), torch.no_grad():
-        if isinstance(camera.lens, Equirectangular) and not method.any_lens:
+        if method.any_lens or isinstance(camera.lens, Pinhole | OpenCV):
+            return method.render(camera)
+        if isinstance(camera.lens, Equirectangular):
             return sphere(method, camera, "Around")
-        if not isinstance(camera.lens, Pinhole | OpenCV) and not method.any_lens:
-            return through_lens(method, camera)
-        return method.render(camera)
+        return through_lens(method, camera)
 
 
 def one_thread() -> None:
