@@ -212,7 +212,7 @@ class Shapes:
     kind: ClassVar[str] = "shapes"
 
     members: list[Shape]
-    splits: dict[str, Int[Tensor, " member"]]
+    splits: dict[str, Int[Tensor, " _"]]
     source: str = ""
 
     def __len__(self) -> int:
