@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import jaxtyping
-from jaxtyping._storage import pop_shape_memo, push_shape_memo, shape_str
+from jaxtyping._storage import get_shape_memo, pop_shape_memo, push_shape_memo, set_shape_memo, shape_str
 
 CHECKED_CALLS = 5
 JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
@@ -78,12 +78,13 @@ def agrees(value: Any, annotation: Any) -> bool:
     if kind in (typing.Union, types.UnionType):
         return any(agrees(value, one) for one in inner)
     if kind is tuple and isinstance(value, tuple):
-        each = [inner[0]] * len(value) if inner[1:] == (...,) else inner
-        return len(each) == len(value) and all(map(agrees, value, each))
+        if inner[1:] == (...,):
+            return all(agrees_alone(one, inner[0]) for one in value)
+        return len(inner) == len(value) and all(map(agrees, value, inner))
     if kind in (list, collections.abc.Sequence) and isinstance(value, list | tuple):
-        return all(agrees(one, inner[0]) for one in value)
+        return all(agrees_alone(one, inner[0]) for one in value)
     if kind in (dict, collections.abc.Mapping) and isinstance(value, dict):
-        return all(agrees(one, inner[1]) for one in value.values())
+        return all(agrees_alone(one, inner[1]) for one in value.values())
     if annotation is float:  # an int will do
         return isinstance(value, int | float)
     try:
@@ -92,11 +93,23 @@ def agrees(value: Any, annotation: Any) -> bool:
         return True
 
 
-def values_of(function: Any, args: tuple[Any, ...], words: dict[str, Any]) -> dict[str, Any]:
-    """What a function's parameters are in a call, but for those of `*args`."""
-    names, defaults = function.__code__.co_varnames[: function.__code__.co_argcount], function.__defaults__ or ()
-    left_out = dict(zip(reversed(names), reversed(defaults), strict=False)) | (function.__kwdefaults__ or {})
-    return left_out | dict(zip(names, args, strict=False)) | words
+def agrees_alone(value: Any, annotation: Any) -> bool:
+    """`agrees` for one of many that need not be alike, as pictures of several sizes: it names no axes for the others."""
+    before = [dict(axes) for axes in get_shape_memo()]
+    found = agrees(value, annotation)
+    set_shape_memo(*before)
+    return found
+
+
+def given(function: Any, args: tuple[Any, ...], words: dict[str, Any]) -> dict[str, Any]:
+    """What a call hands to a function's parameters, those of `*args` left out."""
+    return dict(zip(function.__code__.co_varnames[: function.__code__.co_argcount], args, strict=False)) | words
+
+
+def defaults(function: Any) -> dict[str, Any]:
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    own = dict(zip(reversed(names), reversed(function.__defaults__ or ()), strict=False))
+    return own | (function.__kwdefaults__ or {})
 
 
 def compare(function: Any, values: dict[str, Any], names: Any, annotations: dict[str, Any], axes: Any) -> None:
@@ -134,13 +147,13 @@ def first_calls(function: Any = None, *, typechecker: Any = None) -> Any:
         if calls > CHECKED_CALLS:
             return function(*args, **words)
         annotations = stated(function) if annotations is None else annotations
-        values = values_of(function, args, words)
-        axes = push_shape_memo(values)
+        values = given(function, args, words)
+        axes = push_shape_memo(defaults(function) | values)
         try:
             compare(function, values, annotations.keys() - {"return"}, annotations, axes)
-            given = function(*args, **words)
-            compare(function, {"return": given}, annotations.keys() & {"return"}, annotations, axes)
-            return given
+            result = function(*args, **words)
+            compare(function, {"return": result}, annotations.keys() & {"return"}, annotations, axes)
+            return result
         finally:
             pop_shape_memo()
 

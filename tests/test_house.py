@@ -469,9 +469,9 @@ def test_first_calls_of_each_test_have_their_shapes_checked():
     ("annotation", "right", "wrong"),
     [
         (Float[Tensor, "n 3"] | None, None, np.zeros((2, 3))),
-        (tuple[Int[Tensor, "n"], ...], (torch.arange(2), torch.arange(2)), (torch.arange(2), torch.arange(3))),
+        (tuple[Int[Tensor, "n"], ...], (torch.arange(2), torch.arange(3)), (torch.arange(2), torch.zeros(3))),
         (tuple[Float[Tensor, "n"], int], (torch.zeros(2), 1), (torch.zeros(2, 1), 1)),
-        (Sequence[Float[Tensor, "n"]], [torch.zeros(2)], [torch.zeros(2), torch.zeros(3)]),
+        (Sequence[Float[Tensor, "n"]], [torch.zeros(2), torch.zeros(3)], [torch.zeros(2), torch.zeros(3, 1)]),
         (dict[str, Bool[Tensor, "n"]], {"a": torch.zeros(2).bool()}, {"a": torch.zeros(2)}),
         (Float[Tensor, "{count}"], torch.zeros(7), torch.zeros(6)),
     ],

@@ -36,7 +36,7 @@ class Collection:
     kind: ClassVar[str] = "a collection"
 
     openers: Mapping[str, Callable[[], Dataset]]
-    splits: dict[str, Int[Tensor, " _"]]
+    splits: dict[str, Int[Tensor, " member"]]
     source: str = ""
     _opened: dict[str, Dataset] = field(default_factory=dict, repr=False, compare=False)
     _faults: dict[str, str] = field(default_factory=dict, repr=False, compare=False)  # of members passed over, by name

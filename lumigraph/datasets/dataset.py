@@ -68,7 +68,7 @@ def check_kind(
     )
 
 
-def splits_of(members: int) -> dict[str, Int[Tensor, " _"]]:
+def splits_of(members: int) -> dict[str, Int[Tensor, " member"]]:
     """Splits: every 8th member for testing; a single one for both."""
     index = torch.arange(members)
     held_out = index % HOLD_OUT == 0

@@ -295,7 +295,7 @@ class Scene:
     cameras: Camera
     images: ImageStore
     frame: Frame
-    splits: dict[str, Int[Tensor, " _"]]
+    splits: dict[str, Int[Tensor, " image"]]
     names: list[str]
     source: str = ""
     points: Float[Tensor, "point 3"] | None = None

@@ -212,7 +212,7 @@ class Shapes:
     kind: ClassVar[str] = "shapes"
 
     members: list[Shape]
-    splits: dict[str, Int[Tensor, " _"]]
+    splits: dict[str, Int[Tensor, " member"]]
     source: str = ""
 
     def __len__(self) -> int:
