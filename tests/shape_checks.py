@@ -94,7 +94,7 @@ def agrees(value: Any, annotation: Any) -> bool:
 
 
 def agrees_alone(value: Any, annotation: Any) -> bool:
-    """`agrees` for one of many that need not be alike, as pictures of several sizes: it names no axes for the others."""
+    """`agrees` for one of many that need not be alike, as pictures of several sizes: it names no axes for others."""
     before = [dict(axes) for axes in get_shape_memo()]
     found = agrees(value, annotation)
     set_shape_memo(*before)
