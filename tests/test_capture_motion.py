@@ -37,7 +37,16 @@ from lumigraph.sfm.diagnosis import Matches, coverage, folds, read_matches, why_
 from lumigraph.sfm.georeference import georeference, upright
 from lumigraph.sfm.lenses import group_by_lens, prior, write_database
 from lumigraph.sfm.options import MotionOptions
-from lumigraph.sfm.pairs import aggregated, alike, choose_matching, exhaustive, sequential
+from lumigraph.sfm.pairs import (
+    LOOK_VIEWS,
+    aggregated,
+    alike,
+    choose_matching,
+    exhaustive,
+    overlapping,
+    sequential,
+    shared_features,
+)
 from lumigraph.sfm.pairs import near as near_by
 from lumigraph.sfm.photos import Intake, Photo
 from lumigraph.sfm.reconstruction import Reconstruction, reconstruct
@@ -557,6 +566,21 @@ def test_photographs_of_one_place_are_alike():
     assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
     photos = [np.zeros((0, 128), np.uint8), *photos]
     assert np.isfinite(aggregated(photos.__getitem__, len(photos))).all()
+
+
+def test_a_first_look_leaves_out_pairs_that_share_nothing():
+    """Thirty photographs around a thing: each shares 15 of 25 features with the next, and 5 with the one after that.
+    Pairs further apart are left out, but for the few with which each photograph is compared in any case."""
+    chance = np.random.default_rng(0)
+    ring = chance.normal(size=(30 * 10, 128)).astype(np.float32)
+    seen = [ring[(10 * i + np.r_[0:25]) % 300] for i in range(30)]
+    photos = [x + chance.normal(0, 0.2, x.shape).astype(np.float32) for x in seen]
+    photos = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in photos]
+    assert [shared_features(photos[0], photos[i]) for i in (1, 2, 3, 15)] == [15, 5, 0, 0]
+    assert shared_features(photos[0], photos[0][:1]) == 0
+    found = overlapping(photos)
+    assert {tuple(sorted((i, (i + k) % 30))) for i in range(30) for k in (1, 2)} <= found
+    assert len(found) <= 30 * LOOK_VIEWS < 30 * 29 / 2
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):

@@ -300,6 +300,26 @@ def test_a_loop_is_found_where_the_path_says_so():
     torch.testing.assert_close(loops.motions[0], motion(here, beside), atol=0.02, rtol=0)
 
 
+def test_a_loop_that_does_not_help_is_refused():
+    """The same keyframes at their true poses: features are less exact than the path. And with the drift, but poses of
+    the pose graph that fit worse: the path stays, and the loop is forgotten."""
+    here, beside = steps(2, (0.03, 0.05, 0, 0.05, 0, 0.04))
+    away = steps(2, (0, 2.0, 0, 0, 0, 0))[1]
+    frames = [in_room(0, here), *(in_room(i, away) for i in range(1, 12)), in_room(12, beside)]
+    loops, poses = Loops(1.0), torch.stack([here, *[away] * 11, beside])
+    loops.places.alike = lambda frame, others: []  # type: ignore[method-assign]
+    assert not loops.find(frames[12], frames[:12], poses)
+    drifted = poses.clone()
+    drifted[:, :, 3] += 0.1 * torch.arange(13)[:, None] / 12
+    held = {frame.index: frame for frame in frames}
+    assert loops.find(frames[12], frames[:12], drifted)
+    closed = loops.close(held, drifted)
+    assert closed is not None and float((closed - poses)[12, :, 3].norm()) < 0.06 and len(loops.pairs) == 1
+    assert loops.find(frames[12], frames[:12], drifted) and len(loops.pairs) == 2
+    loops.closed = lambda keyframes, p: p + torch.arange(13)[:, None, None] * 0.1  # type: ignore[method-assign]
+    assert loops.close(held, drifted) is None and len(loops.pairs) == len(loops.motions) == 1
+
+
 def test_features_find_a_fast_camera_that_the_map_does_not():
     """10 cm and 5 degrees a frame, and a map that accepts and spoils all poses: each frame is found to 2 cm. A frame
     without features is lost and has no pose; the next one is found again."""

@@ -25,6 +25,10 @@ SAMPLED_DESCRIPTORS = 500  # per photograph
 VOCABULARY_VIEWS = 240  # photographs from which the vocabulary is learnt
 VOCABULARY_DESCRIPTORS = 30_000  # descriptors from which the vocabulary is learnt
 BLOCK_VIEWS = 256  # photographs compared with all others at a time
+LOOK_FEATURES = 500  # largest features of each photograph in a first look at a pair
+LOOK_RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
+MIN_LOOK_MATCHES = 4  # matches of a first look, with which all features of a pair are compared
+LOOK_VIEWS = 8  # photographs with the most such matches, with which each one is compared in any case
 TILE_VIEWS = 16  # photographs whose features COLMAP keeps in memory: pairs are compared tile by tile
 
 
@@ -62,6 +66,39 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
             if is_one
         }
     return pairs
+
+
+def overlapping(largest: Sequence[Float[np.ndarray, "feature 128"]]) -> set[Pair]:
+    """Pairs that share some of their largest features (preemptive matching: Wu 2013, section 3.1), and of each
+    photograph those that share most.
+
+    largest: descriptors of each photograph's largest features, of unit length
+    """
+    shared = np.zeros((len(largest), len(largest)))
+    for i, j in exhaustive(len(largest)):
+        shared[i, j] = shared[j, i] = shared_features(largest[i], largest[j])
+    most = np.argsort(-shared, axis=1, kind="stable")[:, :LOOK_VIEWS]
+    np.put_along_axis(shared, most, np.inf, 1)
+    return {(min(i, j), max(i, j)) for i, j in np.argwhere(shared >= MIN_LOOK_MATCHES).tolist() if i != j}
+
+
+def shared_features(first: Float[np.ndarray, "a 128"], second: Float[np.ndarray, "b 128"]) -> int:
+    """Number of mutual nearest descriptors, of unit length, that pass the ratio test."""
+    if min(len(first), len(second)) < 2:
+        return 0
+    alike = first @ second.T
+    rows, best, most = np.arange(len(first)), alike.argmax(1), alike.max(0)
+    found = alike[rows, best]
+    alike[rows, best] = -1.0
+    return int(np.count_nonzero((found == most[best]) & (1 - found < LOOK_RATIO**2 * (1 - alike.max(1)))))
+
+
+def largest_features(database: pycolmap.Database, image: int) -> Float[np.ndarray, "feature 128"]:
+    """Descriptors of an image's largest features, of unit length."""
+    places, found = database.read_keypoints(image), database.read_descriptors(image).data
+    size = np.abs(places[:, 2] * places[:, 5] - places[:, 3] * places[:, 4]) if places.shape[1] > 4 else places[:, 2]
+    chosen = found[np.argsort(-size, kind="stable")[:LOOK_FEATURES]].astype(np.float32)
+    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True).clip(1e-9)
 
 
 def aggregated(
@@ -105,23 +142,36 @@ def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBO
 
 
 def choose_pairs(
-    matching: Matching, names: Sequence[str], database: Path, positions: Float[np.ndarray, "photo 3"]
+    matching: Matching,
+    names: Sequence[str],
+    database: Path,
+    positions: Float[np.ndarray, "photo 3"],
+    preempt: bool = True,
 ) -> list[Pair]:
     """Pairs to match, by number, in an order that needs few photographs' features at a time.
 
     names:     in order of exposure or by name
     database:  COLMAP's, with features; read only for similarity
     positions: by GPS, in metres; NaN where unknown
+    preempt:   leave pairs that share none of their largest features out of exhaustive matching
     """
     count = len(names)
-    if matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS:
+    if (all_pairs := matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS) and not preempt:
         pairs = exhaustive(count)
     else:
         with closing(pycolmap.Database.open(database)) as opened:
             number = {image.name: image.image_id for image in opened.read_all_images()}
+            if all_pairs:
+                return in_tiles(
+                    sequential(count, 2) | overlapping([largest_features(opened, number[n]) for n in names])
+                )
             similar = aggregated(lambda photo: opened.read_descriptors(number[names[photo]]).data, count)
         if matching == "sequential":
             pairs = sequential(count) | alike(similar, LOOP_CANDIDATES, apart=SEQUENTIAL_NEIGHBOURS + 1)
         else:
             pairs = sequential(count, 2) | alike(similar, RETRIEVED_VIEWS) | near(positions)
+    return in_tiles(pairs)
+
+
+def in_tiles(pairs: set[Pair]) -> list[Pair]:
     return sorted(pairs, key=lambda pair: (pair[1] // TILE_VIEWS, pair[0] // TILE_VIEWS, pair))

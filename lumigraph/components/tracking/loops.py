@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from ...datasets.scene import Photograph
 from ...method import Part
 from ..training.bundle_adjustment import rotation_vector
 from ..training.shared_points import Seen, features, matched, resected
-from .frames import MIN_COMMON, DepthFrame
+from .frames import MIN_COMMON, MISSED, DepthFrame
 from .trajectory import Pose, apply_twists, relative
 
 THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
@@ -32,6 +33,7 @@ MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
 MIN_INLIERS = 15  # matches that a loop's motion explains; dense depth must agree, too
+CLOSED_ERROR = 0.85  # of the error at the path's own motion, below which the one of a loop is better
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -104,19 +106,42 @@ class Loops(Part):
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], poses: Float[Tensor, "image 3 4"]) -> bool:
         """Search the place of a new keyframe among older ones, those that look alike or see most of its points at the
-        poses of now; True if found."""
+        poses of now; True if one is found that fits both keyframes clearly better than the path does."""
         old = older[:-MIN_AGE]
         common = [frame.compared(x, motion(poses[x.index], poses[frame.index])).common for x in old]
         near = sorted(range(len(old)), key=lambda i: -common[i])[:CANDIDATES]
         beside = [old[i] for i in near if common[i] >= MIN_COMMON]
         for other in {x.index: x for x in [*beside, *self.places.alike(frame, old)]}.values():
             found = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
-            if found is not None and frame.compared(other, found).agrees:
+            if found is None or not (closed := frame.compared(other, found)).agrees:
+                continue
+            if (
+                closed.error
+                < CLOSED_ERROR * frame.compared(other, motion(poses[other.index], poses[frame.index])).error
+            ):
                 pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
                 self.pairs = torch.cat([self.pairs, pair])
                 self.motions = torch.cat([self.motions, found[None].to(self.motions)])
                 return True
         return False
+
+    def close(
+        self, frames: dict[int, DepthFrame], poses: Float[Tensor, "image 3 4"]
+    ) -> Float[Tensor, "keyframe 3 4"] | None:
+        """Poses of keyframes, in order, closed by all loops. None, and the latest loop is forgotten, where neighbours
+        and ends of loops then fit no better than before."""
+        keyframes, after = list(frames), poses.clone()
+        after[keyframes] = self.closed(keyframes, poses[keyframes])
+        pairs = [*pairwise(keyframes), *self.pairs.tolist()]
+
+        def error(poses: Tensor) -> float:
+            errors = [frames[b].compared(frames[a], motion(poses[a], poses[b])).error for a, b in pairs]
+            return sum(min(x, MISSED) for x in errors)
+
+        if error(after) < error(poses):
+            return after[keyframes]
+        self.pairs, self.motions = self.pairs[:-1], self.motions[:-1]
+        return None
 
     def closed(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> Float[Tensor, "keyframe 3 4"]:
         """Poses of keyframes optimised with all loops; the first one is fixed."""
