@@ -85,7 +85,11 @@ class Demand:
         """Sentence with memory and time, shown before the start."""
         width, height = self.size
         side = min(self.max_size, max(self.size))
-        kinds = {"exhaustive": "all that share something", "sequential": "neighbours", "retrieval": "those that look alike"}
+        kinds = {
+            "exhaustive": "all that share something",
+            "sequential": "neighbours",
+            "retrieval": "those that look alike",
+        }
         time = lasting(max(10 * math.ceil(self.seconds / 10), 10))
         return (
             f"{self.count:,} photographs of up to {width}x{height} pixels: {self.features:,} features each at {side:,} "

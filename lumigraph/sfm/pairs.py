@@ -25,10 +25,9 @@ SAMPLED_DESCRIPTORS = 500  # per photograph
 VOCABULARY_VIEWS = 240  # photographs from which the vocabulary is learnt
 VOCABULARY_DESCRIPTORS = 30_000  # descriptors from which the vocabulary is learnt
 BLOCK_VIEWS = 256  # photographs compared with all others at a time
-LOOK_FEATURES = 500  # largest features of each photograph in a first look at a pair
+LOOK_FEATURES = 300  # largest features of each photograph in a first look at all pairs
+LOOK_VIEWS = 12  # photographs that share most of them with each one, which it is compared with
 LOOK_RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
-MIN_LOOK_MATCHES = 4  # matches of a first look, with which all features of a pair are compared
-LOOK_VIEWS = 8  # photographs with the most such matches, with which each one is compared in any case
 TILE_VIEWS = 16  # photographs whose features COLMAP keeps in memory: pairs are compared tile by tile
 
 
@@ -68,37 +67,32 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
     return pairs
 
 
-def overlapping(largest: Sequence[Float[np.ndarray, "feature 128"]]) -> set[Pair]:
-    """Pairs that share some of their largest features (preemptive matching: Wu 2013, section 3.1), and of each
-    photograph those that share most.
+def overlapping(largest: Float[np.ndarray, "photo feature 128"]) -> set[Pair]:
+    """Pairs of each photograph with the LOOK_VIEWS ones that share most of its largest features (preemptive matching:
+    Wu 2013, section 3.1): mutual nearest descriptors that pass the ratio test.
 
-    largest: descriptors of each photograph's largest features, of unit length
+    largest: descriptors of each photograph's largest features, of unit length; zero for none
     """
     shared = np.zeros((len(largest), len(largest)))
-    for i, j in exhaustive(len(largest)):
-        shared[i, j] = shared[j, i] = shared_features(largest[i], largest[j])
+    for photo in range(1, len(largest)):
+        alike = np.tensordot(largest[photo], largest[:photo], (1, 2))  # own feature, other photograph, its feature
+        best, mutual = alike.argmax(2)[..., None], alike.max(0)[None]
+        found = np.take_along_axis(alike, best, 2)
+        mutual = np.take_along_axis(mutual, best.transpose(2, 1, 0), 2).transpose(2, 1, 0) == found
+        np.put_along_axis(alike, best, -1.0, 2)
+        clear = 1 - found[..., 0] < LOOK_RATIO**2 * (1 - alike.max(2))
+        shared[photo, :photo] = shared[:photo, photo] = np.count_nonzero(mutual[..., 0] & clear, axis=0)
+    np.fill_diagonal(shared, -1)
     most = np.argsort(-shared, axis=1, kind="stable")[:, :LOOK_VIEWS]
-    np.put_along_axis(shared, most, np.inf, 1)
-    return {(min(i, j), max(i, j)) for i, j in np.argwhere(shared >= MIN_LOOK_MATCHES).tolist() if i != j}
-
-
-def shared_features(first: Float[np.ndarray, "a 128"], second: Float[np.ndarray, "b 128"]) -> int:
-    """Number of mutual nearest descriptors, of unit length, that pass the ratio test."""
-    if min(len(first), len(second)) < 2:
-        return 0
-    alike = first @ second.T
-    rows, best, most = np.arange(len(first)), alike.argmax(1), alike.max(0)
-    found = alike[rows, best]
-    alike[rows, best] = -1.0
-    return int(np.count_nonzero((found == most[best]) & (1 - found < LOOK_RATIO**2 * (1 - alike.max(1)))))
+    return {(min(i, j), max(i, j)) for i, row in enumerate(most.tolist()) for j in row}
 
 
 def largest_features(database: pycolmap.Database, image: int) -> Float[np.ndarray, "feature 128"]:
-    """Descriptors of an image's largest features, of unit length."""
-    places, found = database.read_keypoints(image), database.read_descriptors(image).data
-    size = np.abs(places[:, 2] * places[:, 5] - places[:, 3] * places[:, 4]) if places.shape[1] > 4 else places[:, 2]
-    chosen = found[np.argsort(-size, kind="stable")[:LOOK_FEATURES]].astype(np.float32)
-    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True).clip(1e-9)
+    """Descriptors of an image's largest features, of unit length; zero where there are fewer than LOOK_FEATURES."""
+    (_, _, a, b, c, d), found = database.read_keypoints(image).T, database.read_descriptors(image).data
+    chosen = found[np.argsort(-np.abs(a * d - b * c), kind="stable")[:LOOK_FEATURES]].astype(np.float32)
+    chosen /= np.linalg.norm(chosen, axis=1, keepdims=True).clip(1e-9)
+    return np.pad(chosen, ((0, LOOK_FEATURES - len(chosen)), (0, 0)))
 
 
 def aggregated(
@@ -153,24 +147,21 @@ def choose_pairs(
     names:     in order of exposure or by name
     database:  COLMAP's, with features; read only for similarity
     positions: by GPS, in metres; NaN where unknown
-    preempt:   leave pairs that share none of their largest features out of exhaustive matching
+    preempt:   of all pairs, take only those that share most of their largest features
     """
     count = len(names)
-    if (all_pairs := matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS) and not preempt:
-        pairs = exhaustive(count)
-    else:
-        with closing(pycolmap.Database.open(database)) as opened:
-            number = {image.name: image.image_id for image in opened.read_all_images()}
-            if all_pairs:
-                return in_tiles(
-                    sequential(count, 2) | overlapping([largest_features(opened, number[n]) for n in names])
-                )
-            similar = aggregated(lambda photo: opened.read_descriptors(number[names[photo]]).data, count)
-        if matching == "sequential":
-            pairs = sequential(count) | alike(similar, LOOP_CANDIDATES, apart=SEQUENTIAL_NEIGHBOURS + 1)
-        else:
-            pairs = sequential(count, 2) | alike(similar, RETRIEVED_VIEWS) | near(positions)
-    return in_tiles(pairs)
+    exhaustively = matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS
+    if exhaustively and (count <= LOOK_VIEWS or not preempt):
+        return in_tiles(exhaustive(count))
+    with closing(pycolmap.Database.open(database)) as opened:
+        number = {image.name: image.image_id for image in opened.read_all_images()}
+        if exhaustively:
+            largest = np.stack([largest_features(opened, number[name]) for name in names])
+            return in_tiles(sequential(count, 2) | overlapping(largest))
+        similar = aggregated(lambda photo: opened.read_descriptors(number[names[photo]]).data, count)
+    if matching == "sequential":
+        return in_tiles(sequential(count) | alike(similar, LOOP_CANDIDATES, apart=SEQUENTIAL_NEIGHBOURS + 1))
+    return in_tiles(sequential(count, 2) | alike(similar, RETRIEVED_VIEWS) | near(positions))
 
 
 def in_tiles(pairs: set[Pair]) -> list[Pair]:
