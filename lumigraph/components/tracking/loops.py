@@ -33,7 +33,7 @@ MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
 MIN_INLIERS = 15  # matches that a loop's motion explains; dense depth must agree, too
-CLOSED_ERROR = 0.85  # of the error at the path's own motion, below which the one of a loop is better
+DRIFTED = 0.45  # contradiction of two keyframes at the poses of a path, from which on it has drifted between them
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -106,19 +106,16 @@ class Loops(Part):
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], poses: Float[Tensor, "image 3 4"]) -> bool:
         """Search the place of a new keyframe among older ones, those that look alike or see most of its points at the
-        poses of now; True if one is found that fits both keyframes clearly better than the path does."""
+        poses of now; True if one is found from which the path has drifted."""
         old = older[:-MIN_AGE]
         common = [frame.compared(x, motion(poses[x.index], poses[frame.index])).common for x in old]
         near = sorted(range(len(old)), key=lambda i: -common[i])[:CANDIDATES]
         beside = [old[i] for i in near if common[i] >= MIN_COMMON]
         for other in {x.index: x for x in [*beside, *self.places.alike(frame, old)]}.values():
-            found = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
-            if found is None or not (closed := frame.compared(other, found)).agrees:
+            if drift(frame, other, poses) < DRIFTED:
                 continue
-            if (
-                closed.error
-                < CLOSED_ERROR * frame.compared(other, motion(poses[other.index], poses[frame.index])).error
-            ):
+            found = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
+            if found is not None and frame.compared(other, found).agrees:
                 pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
                 self.pairs = torch.cat([self.pairs, pair])
                 self.motions = torch.cat([self.motions, found[None].to(self.motions)])
@@ -158,6 +155,14 @@ def motion(first: Pose, second: Pose) -> Pose:
     """Pose of the second in the frame of the first."""
     turn, shift = relative(first, second)
     return torch.cat([turn, shift[:, None]], -1)
+
+
+def drift(frame: DepthFrame, older: DepthFrame, poses: Float[Tensor, "image 3 4"]) -> float:
+    """Contradiction of two frames' depth at these poses, the larger of both directions: 0 to 1. 1 if they have too
+    little in common."""
+    ahead = frame.compared(older, motion(poses[older.index], poses[frame.index]))
+    back = older.compared(frame, motion(poses[frame.index], poses[older.index]))
+    return 1.0 if ahead.common < MIN_COMMON else max(ahead.contradiction, back.contradiction)
 
 
 def optimised(
