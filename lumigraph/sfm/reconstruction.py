@@ -203,14 +203,14 @@ class Reconstruction:
         self.max_size = self.options.max_size * (2 if self.spherical else 1)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
         self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
-        self.preempt = self.options.matching == "auto"
+        self.preempt = self.options.matching != "exhaustive"
         budgets = (features for most, features in FEATURE_BUDGETS if len(self.photos) <= most)
         self.features = next(budgets, MIN_FEATURE_BUDGET)
         self.keys = self.make_keys()
 
     def fit(self, free: int) -> None:
         """Choose sizes that fit into free memory (bytes), and print memory and time."""
-        asked = demand_of(self.photos, self.matching, self.max_size, self.features)
+        asked = demand_of(self.photos, self.matching, self.max_size, self.features, self.preempt)
         chosen, cuts = fitted(asked, free)
         self.max_size, self.features = chosen.max_size, chosen.features
         self.keys = self.make_keys()
@@ -263,7 +263,7 @@ class Reconstruction:
     ) -> None:
         """Detect features of photographs without any in a database, at the largest size that memory allows. contrast:
         factor on COLMAP's threshold"""
-        asked = replace(demand_of(self.photos, self.matching, max_size, features), count=len(names))
+        asked = replace(demand_of(self.photos, self.matching, max_size, features, self.preempt), count=len(names))
         chosen, _ = fitted(asked, free_memory())
         area = PIXELS_PER_FEATURE * features
         coarse = [p.name for p in self.photos if p.name in names and reduced_pixels(p.size, chosen.max_size) >= area]

@@ -34,6 +34,7 @@ CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
 MIN_INLIERS = 15  # matches that a loop's motion explains; dense depth must agree, too
 DRIFTED = 0.45  # contradiction of two keyframes at the poses of a path, from which on it has drifted between them
+MIN_JUDGED = 0.05  # share of points in common, from which on depth can contradict
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -158,11 +159,11 @@ def motion(first: Pose, second: Pose) -> Pose:
 
 
 def drift(frame: DepthFrame, older: DepthFrame, poses: Float[Tensor, "image 3 4"]) -> float:
-    """Contradiction of two frames' depth at these poses, the larger of both directions: 0 to 1. 1 if they have too
-    little in common."""
+    """Contradiction of two frames' depth at these poses, the larger of both directions: 0 to 1. 1 if they have hardly
+    a point in common."""
     ahead = frame.compared(older, motion(poses[older.index], poses[frame.index]))
     back = older.compared(frame, motion(poses[frame.index], poses[older.index]))
-    return 1.0 if ahead.common < MIN_COMMON else max(ahead.contradiction, back.contradiction)
+    return 1.0 if ahead.common < MIN_JUDGED else max(ahead.contradiction, back.contradiction)
 
 
 def optimised(
