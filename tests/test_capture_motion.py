@@ -582,6 +582,8 @@ def test_a_first_look_leaves_out_pairs_that_share_little():
     photos[7] = 0
     found = overlapping(photos)
     assert len([pair for pair in found if 7 in pair]) >= LOOK_VIEWS and {(2, 3), (3, 4)} <= found
+    counts = [demand.demand_of([photo("")] * 40, "exhaustive", 1600, 8192, preempt).pairs for preempt in (True, False)]
+    assert len(found) + len(sequential(40, 2)) <= counts[0] < counts[1] == 780
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):
