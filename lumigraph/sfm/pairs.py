@@ -27,6 +27,7 @@ VOCABULARY_DESCRIPTORS = 30_000  # descriptors from which the vocabulary is lear
 BLOCK_VIEWS = 256  # photographs compared with all others at a time
 LOOK_FEATURES = 300  # largest features of each photograph in a first look at all pairs
 LOOK_VIEWS = 12  # photographs that share most of them with each one, which it is compared with
+MIN_LOOK_FEATURES = 2500  # of a photograph (mean), below which all pairs cost little, and poor photographs need them
 LOOK_RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
 TILE_VIEWS = 16  # photographs whose features COLMAP keeps in memory: pairs are compared tile by tile
 
@@ -147,7 +148,7 @@ def choose_pairs(
     names:     in order of exposure or by name
     database:  COLMAP's, with features; read only for similarity
     positions: by GPS, in metres; NaN where unknown
-    preempt:   of all pairs, take only those that share most of their largest features
+    preempt:   of all pairs, take only those that share most of their largest features, where there are many features
     """
     count = len(names)
     exhaustively = matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS
@@ -155,6 +156,8 @@ def choose_pairs(
         return in_tiles(exhaustive(count))
     with closing(pycolmap.Database.open(database)) as opened:
         number = {image.name: image.image_id for image in opened.read_all_images()}
+        if exhaustively and opened.num_descriptors() < MIN_LOOK_FEATURES * count:
+            return in_tiles(exhaustive(count))
         if exhaustively:
             largest = np.stack([largest_features(opened, number[name]) for name in names])
             return in_tiles(sequential(count, 2) | overlapping(largest))
