@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from lumigraph.commands.track import tracked_downscale
+from lumigraph.components.tracking.frames import DepthFrame
 from lumigraph.components.tracking.loops import motion
 from lumigraph.components.tracking.tracker import Tracker, TrackingNumbers
 from lumigraph.components.tracking.trajectory import apply_twists, moved, relative, rigid
@@ -57,7 +58,8 @@ def main() -> None:
     data = open_scene(given.recording, unposed={}, downscale=tracked_downscale(given.recording, None))
     unit = 1 / data.frame.to_source.scale
     truth = true_poses(data)[:: given.every]
-    images, held, places = range(0, len(data), given.every), {}, None
+    images, places = range(0, len(data), given.every), None
+    held: dict[int, DepthFrame] = {}
     for turn, shift in DRIFTS:
         tracker = Tracker(len(data), TrackingNumbers(track=True, close_loops=True), unit, given.side)
         assert tracker.loops is not None

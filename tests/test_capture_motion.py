@@ -38,7 +38,6 @@ from lumigraph.sfm.georeference import georeference, upright
 from lumigraph.sfm.lenses import MODEL, group_by_lens, prior, write_database
 from lumigraph.sfm.options import MotionOptions
 from lumigraph.sfm.pairs import (
-    LOOK_VIEWS,
     aggregated,
     alike,
     choose_matching,
@@ -570,7 +569,7 @@ def test_photographs_of_one_place_are_alike():
 
 def test_a_first_look_leaves_out_pairs_that_share_little():
     """Forty photographs around a thing share 60, 50, 40, 30, 20, 10 of their features with the six on each side: these
-    alone are compared. One without features is compared with some."""
+    alone are compared. One without features is compared with all."""
     chance = np.random.default_rng(0)
     ring = chance.normal(size=(400, 128)).astype(np.float32)
     seen = ring[(10 * np.arange(40)[:, None] + np.arange(70)) % 400]
@@ -582,16 +581,17 @@ def test_a_first_look_leaves_out_pairs_that_share_little():
     photos[3, 5:] = 0
     photos[7] = 0
     found = overlapping(photos)
-    assert len([pair for pair in found if 7 in pair]) >= LOOK_VIEWS and {(2, 3), (3, 4)} <= found
+    assert len([pair for pair in found if 7 in pair]) == 39 and {(2, 3), (3, 4)} <= found
     counts = [demand.demand_of([photo("")] * 40, "exhaustive", 1600, 8192, preempt).pairs for preempt in (True, False)]
     assert len(found) + len(sequential(40, 2)) <= counts[0] < counts[1] == 780
 
 
 @pytest.mark.parametrize("features", [2, 40])
 def test_poor_photographs_are_compared_with_all(tmp_path, monkeypatch, features):
-    """Fourteen photographs: with few features every pair is compared, with many those that share most; asked for, all."""
+    """With few features, and where it is asked for, every pair is compared; with many those that share most."""
     monkeypatch.setattr("lumigraph.sfm.pairs.MIN_LOOK_FEATURES", 20)
-    chance, names = np.random.default_rng(0), [f"{i:02d}.png" for i in range(14)]
+    monkeypatch.setattr("lumigraph.sfm.pairs.MIN_SHARED", 0)
+    chance, names = np.random.default_rng(0), [f"{i:02d}.png" for i in range(30)]
     write_database(tmp_path / "database.db", [[photo(name) for name in names]], MODEL)
     with closing(pycolmap.Database.open(tmp_path / "database.db")) as opened:
         for image in opened.read_all_images():
@@ -600,12 +600,12 @@ def test_poor_photographs_are_compared_with_all(tmp_path, monkeypatch, features)
                 pycolmap.FeatureExtractorType.SIFT, chance.integers(0, 90, (features, 128)).astype(np.uint8)
             )
             opened.write_descriptors(image.image_id, found)
-    nowhere = np.full((14, 3), np.nan)
+    nowhere = np.full((30, 3), np.nan)
     chosen, every = (
         choose_pairs("exhaustive", names, tmp_path / "database.db", nowhere, preempt=preempt)
         for preempt in (True, False)
     )
-    assert len(every) == 91 and (set(chosen) == set(every)) == (features < 20) and set(chosen) <= set(every)
+    assert len(every) == 435 and (set(chosen) == set(every)) == (features < 20) and set(chosen) <= set(every)
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):

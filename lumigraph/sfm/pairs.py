@@ -27,6 +27,7 @@ VOCABULARY_DESCRIPTORS = 30_000  # descriptors from which the vocabulary is lear
 BLOCK_VIEWS = 256  # photographs compared with all others at a time
 LOOK_FEATURES = 300  # largest features of each photograph in a first look at all pairs
 LOOK_VIEWS = 12  # photographs that share most of them with each one, which it is compared with
+MIN_SHARED = 250  # features that these share with it, all together, below which it is compared with all photographs
 MIN_LOOK_FEATURES = 2500  # of a photograph (mean), below which all pairs cost little, and poor photographs need them
 LOOK_RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
 TILE_VIEWS = 16  # photographs whose features COLMAP keeps in memory: pairs are compared tile by tile
@@ -70,7 +71,7 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
 
 def overlapping(largest: Float[np.ndarray, "photo feature 128"]) -> set[Pair]:
     """Pairs of each photograph with the LOOK_VIEWS ones that share most of its largest features (preemptive matching:
-    Wu 2013, section 3.1): mutual nearest descriptors that pass the ratio test.
+    Wu 2013, section 3.1): mutual nearest descriptors that pass the ratio test. One that shares few is paired with all.
 
     largest: descriptors of each photograph's largest features, of unit length; zero for none
     """
@@ -85,7 +86,9 @@ def overlapping(largest: Float[np.ndarray, "photo feature 128"]) -> set[Pair]:
         shared[photo, :photo] = shared[:photo, photo] = np.count_nonzero(mutual[..., 0] & clear, axis=0)
     np.fill_diagonal(shared, -1)
     most = np.argsort(-shared, axis=1, kind="stable")[:, :LOOK_VIEWS]
-    return {(min(i, j), max(i, j)) for i, row in enumerate(most.tolist()) for j in row}
+    poor = np.take_along_axis(shared, most, 1).sum(1) < MIN_SHARED
+    pairs = {(min(i, j), max(i, j)) for i, row in enumerate(most.tolist()) for j in row}
+    return pairs | {(i, j) for i, j in exhaustive(len(largest)) if poor[i] or poor[j]}
 
 
 def largest_features(database: pycolmap.Database, image: int) -> Float[np.ndarray, "feature 128"]:
