@@ -3,6 +3,7 @@
     python benchmarks/tables.py                                             write the tables anew
     python benchmarks/tables.py --collect OUTPUT OUTPUT --commit COMMIT     collect the figures first
     python benchmarks/tables.py --gallery OUTPUT --commit COMMIT            the gallery's
+    python benchmarks/tables.py --check                                     list stale results and tables made by hand
 
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
@@ -22,6 +23,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import ages
 
 from lumigraph import methods
 from lumigraph.lab.benchmark.gallery import SECTIONS, SHOWPIECES
@@ -52,8 +55,13 @@ class Options:
     collect: tuple[Path, ...] = ()  # outputs of `lumigraph bench methods`
     gallery: tuple[Path, ...] = ()  # output of `lumigraph gallery`
     commit: str = ""  # that they ran
+    check: bool = False  # write nothing; list stale results, tables made by hand, and the share of generated figures
 
     def run(self) -> None:
+        if self.check:
+            texts = {str(page.relative_to(ROOT)): page.read_text("utf-8") for page in pages()}
+            print(*ages.report(texts), sep="\n")
+            return
         for outputs, path in ((self.collect, RESULTS), (self.gallery, GALLERY)):
             if outputs:
                 found = collected(outputs, self.commit)
