@@ -139,6 +139,6 @@ def report(pages: dict[str, str]) -> Iterator[str]:
     yield f"{sum(map(bool, lacks.values()))} files of results lack fields"
     yield from (f"  {name}: {', '.join(fields)}" for name, fields in lacks.items() if fields)
     found = count(pages)
-    yield f"{sum(found.by_hand.values())} tables on {len(found.by_hand)} pages have figures that no file of results makes"
+    yield f"{sum(found.by_hand.values())} tables on {len(found.by_hand)} pages have figures that no result makes"
     yield from (f"  {name}: {number}" for name, number in found.by_hand.items())
     yield f"{found.made:,} of {found.figures:,} figures ({found.share:.0%}) stand in generated tables"

@@ -83,8 +83,8 @@ class Options:
 
 @dataclasses.dataclass
 class Notes:
-    """Lines of metrics.jsonl, by the trainer's protocol of a watch. It ends training after seconds of a processor, those
-    of the first step, which compiles, not counted."""
+    """Lines of metrics.jsonl, by the trainer's protocol of a watch. It ends training after seconds of a processor,
+    without those of the first step, which compiles."""
 
     seconds: float
     rows: list[dict[str, Any]] = dataclasses.field(default_factory=list)
