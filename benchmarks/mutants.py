@@ -13,6 +13,7 @@ import ast
 import multiprocessing
 import os
 import random
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -81,6 +82,7 @@ def judge(files: list[str]) -> None:
     """Run tests quietly, from a process that has PyTorch and pytest but nothing of the package."""
     import pytest
 
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     sys.stdout = sys.stderr = open(os.devnull, "w")
     os._exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *files])))
 
@@ -103,6 +105,7 @@ def survives(module: str, text: str, seconds: int) -> bool:
 def main(options: Options) -> None:
     import torch  # noqa: F401  children share it
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the file is put back
     os.chdir(ROOT)
     sys.dont_write_bytecode = True
     modules = options.modules or tuple(TESTS)
