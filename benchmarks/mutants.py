@@ -3,8 +3,8 @@
     python benchmarks/mutants.py --count 60 --seed 0       a random sample, the same for the same seed
 
 A mutant has one change: + for -, < for <=, 0 for 1 (each also the other way), a minus dropped, or a number a tenth
-larger. The file is changed in place, the tests run in a process of their own, and the file is put back. A mutant
-survives if all tests pass; one that takes longer than `seconds` counts as killed.
+larger. It runs in memory, in place of its module, in a process of its own; no file changes. A mutant survives if all
+tests pass; one that takes longer than `seconds` counts as killed.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import ast
 import multiprocessing
 import os
 import random
-import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -78,50 +78,79 @@ def mutant(source: str, number: int) -> tuple[str, str]:
     return ast.unparse(tree), f"line {node.lineno}, {change}"  # type: ignore[attr-defined]
 
 
-def judge(files: list[str]) -> None:
-    """Run tests quietly, from a process that has PyTorch and pytest but nothing of the package."""
-    import pytest
+def put(module: str, text: str) -> None:
+    """Run a module's new text in its place; what others had imported from it becomes the new one too."""
+    name = "lumigraph." + module.removesuffix("/__init__.py").removesuffix(".py").replace("/", ".")
+    own = vars(sys.modules[name])
+    before = {key: value for key, value in own.items() if getattr(value, "__module__", None) == name}
+    exec(compile(text, own["__file__"], "exec"), own)
+    new = {id(value): own[key] for key, value in before.items()}
+    for other in list(sys.modules.values()):
+        for key, value in list(getattr(other, "__dict__", {}).items()):
+            if id(value) in new and other.__name__.startswith(("lumigraph", "test_")):
+                setattr(other, key, new[id(value)])
 
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    sys.stdout = sys.stderr = open(os.devnull, "w")
-    os._exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *files])))
 
+def judge(session: Any, module: str, text: str) -> None:
+    """Run the narrow tests of a module, quietly, with another text in its place."""
+    from _pytest.main import pytest_runtestloop
 
-def survives(module: str, text: str, seconds: int) -> bool:
-    """Whether all tests of a module pass with another text in place of it."""
-    path, files = ROOT / "lumigraph" / module, [f"tests/test_{name}.py" for name in TESTS[module].split()]
-    kept = path.read_bytes()
-    child = multiprocessing.get_context("fork").Process(target=judge, args=(files,))
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+    put(module, text)
+    session.items = [item for item in session.items if item.path.name in files_of([module])]
+    session.config.option.maxfail = 1
     try:
-        path.write_text(text, "utf-8")
-        child.start()
-        child.join(seconds)
-        return child.exitcode == 0
+        pytest_runtestloop(session)
     finally:
-        path.write_bytes(kept)
-        child.kill()
+        os._exit(int(session.testsfailed > 0))
+
+
+def files_of(modules: Iterable[str]) -> list[str]:
+    return sorted({f"test_{name}.py" for module in modules for name in TESTS[module].split()})
+
+
+def survives(session: Any, module: str, text: str, seconds: int) -> bool:
+    """Whether all tests of a module pass with another text in its place, in a process that ends after seconds."""
+    child = multiprocessing.get_context("fork").Process(target=judge, args=(session, module, text))
+    child.start()
+    child.join(seconds)
+    child.kill()
+    child.join()
+    return child.exitcode == 0
+
+
+@dataclass
+class Trial:
+    """Plugin of pytest that tries mutants in place of the tests, once these are collected."""
+
+    options: Options
+    modules: list[str]
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        o, sources = self.options, {m: (ROOT / "lumigraph" / m).read_text("utf-8") for m in self.modules}
+        for module in [m for m in self.modules if not survives(session, m, sources[m], 2 * o.seconds)]:
+            print(f"{module}: left out, its tests fail where the module itself is run in its place", flush=True)
+            self.modules.remove(module)
+        places = [(m, i) for m in self.modules for i, _ in enumerate(faults(ast.parse(sources[m])))]
+        chosen, alive = random.Random(o.seed).sample(places, min(o.count, len(places))), 0
+        for tried, (module, place) in enumerate(chosen, 1):
+            text, where = mutant(sources[module], place)
+            lives = survives(session, module, text, o.seconds)
+            alive += lives
+            about = f"{tried - alive} killed of {tried}, {len(places)} places"
+            print(f"{module}, {where}: {'SURVIVES' if lives else 'killed'} ({about})", flush=True)
+        return True
 
 
 def main(options: Options) -> None:
-    import torch  # noqa: F401  children share it
+    import pytest
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # the file is put back
     os.chdir(ROOT)
-    sys.dont_write_bytecode = True
-    modules = options.modules or tuple(TESTS)
-    sources = {module: (ROOT / "lumigraph" / module).read_text("utf-8") for module in modules}
-    places = [(m, i) for m, source in sources.items() for i, _ in enumerate(faults(ast.parse(source)))]
-    chosen = random.Random(options.seed).sample(places, min(options.count, len(places)))
-    for module in {module for module, _ in chosen}:
-        if not survives(module, sources[module], 2 * options.seconds):
-            raise SystemExit(f"The tests of {module} fail without a fault: tests/test_({TESTS[module]}).py")
-    alive = 0
-    for tried, (module, number) in enumerate(chosen, 1):
-        text, where = mutant(sources[module], number)
-        lives = survives(module, text, options.seconds)
-        alive += lives
-        print(f"{tried}: {module}, {where}: {'SURVIVES' if lives else 'killed'}", flush=True)
-    print(f"{len(chosen)} of {len(places)} places tried, {len(chosen) - alive} killed, {alive} survive")
+    modules = list(options.modules or TESTS)
+    files = [f"tests/{name}" for name in files_of(modules)]
+    pytest.main(["-q", "-s", "-p", "no:cacheprovider", *files], plugins=[Trial(options, modules)])
 
 
 if __name__ == "__main__":
