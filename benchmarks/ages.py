@@ -80,8 +80,9 @@ def count(pages: dict[str, str]) -> Count:
 
 @functools.cache
 def code_of(source: str) -> str:
-    """Code without comments, docstrings and layout."""
+    """Code without comments, docstrings, layout, and the sources of a method's numbers."""
     tree = ast.parse(source)
+    tree.body = [x for x in tree.body if not (isinstance(x, ast.Assign) and ast.unparse(x.targets[0]) == "SOURCES")]
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if (
@@ -112,7 +113,9 @@ def same_code(commit: str, name: str, root: Path) -> bool:
 
 def lacking(found: dict[str, Any]) -> list[str]:
     """Fields that neither a file of results nor all of its rows have. A plural counts as its singular."""
-    rows = next((found[name] for name in ("cells", "rows", "trainings") if isinstance(found.get(name), list)), [])
+    rows: list[dict[str, Any]] = next(
+        (found[name] for name in ("cells", "rows", "trainings") if isinstance(found.get(name), list)), []
+    )
     return [x for x in FIELDS if not {x, f"{x}s"} & {*found} and not (rows and all({x, f"{x}s"} & {*r} for r in rows))]
 
 

@@ -49,7 +49,7 @@ def test_only_changes_of_code_make_results_stale(tmp_path):
     subprocess.run(["git", "init", "-q", "."], cwd=tmp_path, check=True)
     commit("def half(x):\n    return x / 2\n")
     measured = ages.git("rev-parse", "HEAD", root=tmp_path).strip()
-    commit('def half(x):\n    """Half of x."""\n\n    return (x / 2)  # exact\n')
+    commit('SOURCES = {"a": "b"}\n\n\ndef half(x):\n    """Half of x."""\n\n    return (x / 2)  # exact\n')
     assert ages.changed_since(measured, ["lens.py"], tmp_path) == []
     commit("def half(x):\n    return x / 3\n")
     assert ages.changed_since(measured, ["lens.py"], tmp_path) == ["lens.py"]
