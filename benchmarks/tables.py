@@ -3,13 +3,15 @@
     python benchmarks/tables.py                                             write the tables anew
     python benchmarks/tables.py --collect OUTPUT OUTPUT --commit COMMIT     collect the figures first
     python benchmarks/tables.py --gallery OUTPUT --commit COMMIT            the gallery's
+    python benchmarks/tables.py --check                                     list stale results and tables made by hand
 
 OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
 comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
 one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
 choose rows; `table: strangers` is of `strangers.py --publish`, `table: minute` of `one_minute.py --publish`,
 `table: reading` of `reading.py --publish`; `parameters`, `owntests`, `trainings`, `loops` of `gsplat_compat.py
---publish`; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+--publish`; `presets` and `preset NAME` of `paper_presets.py`;
+`<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import ages
+
 from lumigraph import methods
 from lumigraph.lab.benchmark.gallery import SECTIONS, SHOWPIECES
 from lumigraph.lab.benchmark.published import first_of
@@ -33,7 +37,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
 GALLERY, STRANGERS = RESULTS.with_name("gallery-cpu.json"), RESULTS.with_name("strangers-cpu.json")
 MINUTE, READING = RESULTS.with_name("one-minute-cpu.json"), RESULTS.with_name("reading-cpu.json")
-SPLATS = RESULTS.with_name("gsplat-cpu.json")
+SPLATS, PRESETS = RESULTS.with_name("gsplat-cpu.json"), RESULTS.with_name("paper-presets-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 GUIDES = {  # pages about sections of the gallery, in docs/
@@ -52,8 +56,13 @@ class Options:
     collect: tuple[Path, ...] = ()  # outputs of `lumigraph bench methods`
     gallery: tuple[Path, ...] = ()  # output of `lumigraph gallery`
     commit: str = ""  # that they ran
+    check: bool = False  # write nothing; list stale results, tables made by hand, and the share of generated figures
 
     def run(self) -> None:
+        if self.check:
+            texts = {str(page.relative_to(ROOT)): page.read_text("utf-8") for page in pages()}
+            print(*ages.report(texts), sep="\n")
+            return
         for outputs, path in ((self.collect, RESULTS), (self.gallery, GALLERY)):
             if outputs:
                 found = collected(outputs, self.commit)
@@ -72,7 +81,7 @@ class Options:
 def read() -> dict[str, Any]:
     """Results of `lumigraph bench methods`, and of other programs as parts of them."""
     results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
-    others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE, "reading": READING}
+    others = {"gallery": GALLERY, "strangers": STRANGERS, "minute": MINUTE, "reading": READING, "presets": PRESETS}
     splats = json.loads(SPLATS.read_text("utf-8"))
     parts = {
         name: splats | {"cells": splats[name], "commands": splats["commands"][name]} for name in splats["commands"]
@@ -131,7 +140,10 @@ def filled(text: str, page: Path, results: dict[str, Any]) -> str:
         cells = [row for row in of["cells"] if not names or row["method"] in names]
         if not cells:
             return f"{match[1]}Not measured.\n"
-        about, lines = f"Commit `{of['commit']}`; {of['machine'].removeprefix('cpu, ')}, no GPU.", of["commands"]
+        commit = of.get("commit") or "`, `".join(sorted({row["commit"] for row in cells}))
+        about, lines = f"Commit `{commit}`; {of['machine'].removeprefix('cpu, ')}, no GPU.", of["commands"]
+        if kind == "preset":
+            lines = [f"python benchmarks/paper_presets.py {names[0]} --again"]
         if kind not in OTHERS:
             about, lines = f"{about} {scenes_of(cells)}", commands(cells)
         return "\n".join([match[1].rstrip(), *KINDS[kind](cells, page), "", about, "", "```", *lines, "```", ""])
@@ -277,6 +289,59 @@ def by_strategy(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
+def by_preset(cells: Sequence[Row], page: Path) -> list[str]:
+    """Each `--preset paper` after some steps: its loss, time, memory, and the hours of the paper's length."""
+    rows = [["method", "scene", "steps", "loss, first and last fifth", "s a step", "memory", "paper's steps", "hours"]]
+    for row in cells:
+        told = [f"`{Path(row['scene']).name}`", str(row["steps"]), loss_of(row), "", "", "", ""]
+        if row["seconds_per_step"]:
+            told[3] = f"{row['seconds_per_step']:.2g}"
+        if row["peak_memory"]:
+            told[4] = size(row["peak_memory"])
+        if row["paper_steps"] and row["seconds_per_step"]:
+            told[5:] = [f"{row['paper_steps']:,}", hours_of(row)]
+        rows.append([link(row["method"], page), *told])
+    return markdown(rows)
+
+
+def by_one_preset(cells: Sequence[Row], page: Path) -> list[str]:
+    """A sentence on the first steps of a method's `--preset paper`."""
+    (row,) = cells
+    few = ", ".join(f"`{name}` {number:,}" for name, number in row["numbers"].items())
+    text = f"**The preset `paper`** was not trained to its end here. It took {row['steps']} steps on `{row['scene']}`"
+    text += f" with {few}." if few else "."
+    if row["loss"]:
+        text += f" Its loss, over the first and the last fifth of them: {loss_of(row)}."
+    if row["seconds_per_step"]:
+        text += f" A step takes {row['seconds_per_step']:.2g} s of one processor"
+        text += f", in {size(row['peak_memory'])} of memory." if row["peak_memory"] else "."
+    if row["paper_steps"] and row["seconds_per_step"]:
+        text += f" The paper's {row['paper_steps']:,} steps would take hours: {hours_of(row)}."
+    return [text]
+
+
+def loss_of(row: Row) -> str:
+    """Means of the loss over the first and the last fifth of the steps, and why it does not fall where it does not."""
+    if not row["loss"]:
+        return "it does not train" if row["method"] in UNTRAINED else "too few steps"
+    first, *_, last = row["loss"]
+    return f"{first:.3g} to {last:.3g}" + (f" ({RISES.get(row['method'], 'few rays')})" if last >= first else "")
+
+
+def hours_of(row: Row) -> str:
+    """Hours that the paper's steps take at this batch, which is less than the paper's."""
+    few = f", at 1/{1 / row['batch_share']:,.0f} of its batch" if row["batch_share"] < 1 else ""
+    return f"over {row['seconds_per_step'] * row['paper_steps'] / 3600:,.0f}{few}"
+
+
+UNTRAINED = "lumigraph", "view-interpolation", "tsdf-fusion"  # by descent; their preparation is in the first step
+RISES = {  # losses that do not fall within a hundred steps
+    "tensorf": "a grid of 128³ cells begins almost transparent",
+    "plenoxels": "a grid of 256³ cells learns in each step from few of them",
+    "hyp-nerf": "16 rays a step, each of another object",
+    "eg3d": "an adversary learns too",
+    "gancraft": "an adversary learns too",
+}
 QUALIFIERS = {  # of scores in the gallery that are not of held-out views, or that a minute says little about
     "occupancy-network": "of the mesh that it learnt",
     "deepsdf": "of the mesh that it learnt",
@@ -331,6 +396,8 @@ KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
     "owntests": by_test,
     "trainings": by_strategy,
     "loops": by_loop,
+    "presets": by_preset,
+    "preset": by_one_preset,
 }
 OTHERS = {
     "sections": "gallery",
@@ -342,6 +409,8 @@ OTHERS = {
     "owntests": "owntests",
     "trainings": "trainings",
     "loops": "loops",
+    "presets": "presets",
+    "preset": "presets",
 }  # where the figures of a table are
 
 

@@ -4,6 +4,7 @@ Commands in the documents: their options exist."""
 from __future__ import annotations
 
 import dataclasses
+import pkgutil
 import re
 import runpy
 import shlex
@@ -250,6 +251,17 @@ def test_documents_name_options_that_are_there():
         for name in lost_options(command)
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_ten_ideas_have_a_command_an_equation_and_a_function():
+    ideas = re.split(r"(?m)^## ", (ROOT / "docs" / "from-light-fields.md").read_text("utf-8"))[1:]
+    assert len(ideas) == 10
+    for idea in ideas:
+        names = re.findall(r"`(lumigraph\.[\w.]+)`", idea)
+        assert names and idea.count("```math") == 1 and any(commands(idea)), idea.splitlines()[0]
+        assert all(pkgutil.resolve_name(name) for name in names)
+        own = [name for name in names if not name.startswith("lumigraph.reading.")]
+        assert own and all(callable(pkgutil.resolve_name(name)) for name in own), names
 
 
 def test_a_lost_option_is_noticed():

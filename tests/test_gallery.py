@@ -11,6 +11,7 @@ from test_benchmark import Here
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.lab.benchmark import gallery as room
+from lumigraph.lab.benchmark.cell import read_rows
 from lumigraph.lab.benchmark.published import Published
 
 pytestmark = budget("runs", 4)
@@ -31,8 +32,10 @@ def test_a_page_has_picture_idea_and_figures(ball_folder, tmp_path, monkeypatch)
     assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=here) == 0
     page = (tmp_path / "out" / "gallery.html").read_text()
     owner = "published, of other data: 99 dB: no scene, no pixels (measured by Nobody 1999)"
-    for part in ("<h2>Grids</h2>", "Voxels &amp; colours.", "PSNR", owner, "data:image/jpeg"):
+    for part in ("<h2>Grids</h2>", "Voxels &amp; colours.", "PSNR", owner, "data:image/jpeg", "load "):
         assert part in page, part
+    (row,) = read_rows(tmp_path / "out").values()
+    assert f"{row['steps']} steps in {row['training_seconds']:.0f} s from {row['train_views']} views" in page
     again = Here()
     assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=again) == 0 and again.seen == []
 

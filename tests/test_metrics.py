@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lumigraph.metrics import psnr, ssim, ssim_map
+from lumigraph.metrics import normal_consistency, psnr, ssim, ssim_map
 from lumigraph.metrics.detail import detail
 
 
@@ -68,3 +68,11 @@ def test_detail_tells_a_shift_from_blur(generator):
     seen = torch.where(half[..., None], inner, blurred)
     assert detail(seen, inner, half).sharpness == pytest.approx(1, abs=0.05)
     assert detail(texture[:9, :9], texture[:9, :9]) is None and detail(0 * texture, 0 * texture) is None
+
+
+def test_normals_are_compared_with_those_of_the_nearest_point():
+    """Two points in the other order, the normal of one turned by 30 degrees: the mean of cosines 1 and cos 30."""
+    points, up, side = torch.tensor([[0.0, 0, 0], [1, 0, 0]]), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+    turned = (0.0, 0.5, 0.75**0.5)
+    found = normal_consistency(points, torch.tensor([up, side]), points.flip(0), torch.tensor([side, turned]))
+    assert found == pytest.approx((1 + 0.75**0.5) / 2)

@@ -62,6 +62,12 @@ class Config(BaseConfig):
     learning_rate: LearningRate = 3e-4  # Adam's learning rate
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "facebookresearch/multiface, models.py (db70c1a)": "code channels max_channels view_features mesh_width",
+    "facebookresearch/multiface, train.py (db70c1a)": "texture_log2 divergence_weight textures_per_step learning_rate",
+}
+
+
 @dataclass(frozen=True)
 class Unwrapped:
     """Photographs as textures.

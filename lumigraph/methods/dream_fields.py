@@ -48,6 +48,17 @@ class Config(BaseConfig):
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher: faster, may diverge
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google-research/google-research, dreamfields/dreamfields/config/config_base.py (aca5f2e)": (
+        "crops_per_view min_elevation max_elevation camera_distance focal transmittance_weight initial_opacity "
+        "final_opacity opacity_steps steps_per_diagonal sh_bands"
+    ),
+    "google-research/google-research, dreamfields/dreamfields/config/config_mq.py (aca5f2e)": "render_width crop_share",
+    "Jain 2022, section 4": "views_per_step origin_decay",
+    "Poole 2022, section 3": "guidance_scale min_time max_time",
+}
+
+
 class DreamFields(FieldMethod):
     """A hash table in a box, optimised so that random views match a prompt."""
 

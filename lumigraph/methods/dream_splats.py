@@ -45,6 +45,21 @@ class Config(BaseConfig):
     initial_gaussians: CloudSize = 5000  # Gaussians of the cloud, whose number stays; more hold finer detail
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "dreamgaussian/dreamgaussian, configs/text.yaml (69a3c70)": (
+        "initial_gaussians means_lr final_means_lr sh_lr opacities_lr scales_lr quaternions_lr"
+    ),
+    "dreamgaussian/dreamgaussian, gs_renderer.py (69a3c70)": "initial_radius",
+    "dreamgaussian/dreamgaussian, guidance/sd_utils.py (69a3c70)": "guidance_scale min_time max_time",
+    "google-research/google-research, dreamfields/dreamfields/config/config_base.py (aca5f2e)": (
+        "crops_per_view min_elevation max_elevation camera_distance focal transmittance_weight initial_opacity "
+        "final_opacity opacity_steps"
+    ),
+    "google-research/google-research, dreamfields/dreamfields/config/config_mq.py (aca5f2e)": "render_width crop_share",
+    "Jain 2022, section 4": "views_per_step origin_decay",
+}
+
+
 class DreamSplats(Method):
     """Gaussians in a ball, optimised so that random views match a prompt. Their number is constant."""
 

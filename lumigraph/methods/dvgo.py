@@ -58,7 +58,7 @@ class Config(BaseConfig):
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20)  # 8192 rays, section 6.1
     proposals: ProposalNumbers = ProposalNumbers()
     measured: DepthNumbers = DepthNumbers()
-    coarse_voxels: Voxels = 100**3  # voxels of the coarse stage, section 6.1; more cost memory and time
+    coarse_voxels: Voxels = 1_024_000  # voxels of the coarse stage, the release's; more cost memory and time
     voxels: Voxels = 160**3  # voxels of the fine stage at its end, section 6.1; more give detail, cost memory
     hidden_width: Width = 128  # channels of the colour network, section 6.1; wider costs time
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
@@ -77,7 +77,7 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "sunset1995/DirectVoxGO, configs/default.py": (
+    "sunset1995/DirectVoxGO, configs/default.py (341e1fc)": (
         "coarse_voxels voxels feature_channels hidden_width hidden_layers coarse_alpha fine_alpha doublings "
         "growing_share box_alpha step_size weight_threshold density_learning_rate feature_learning_rate "
         "network_learning_rate coarse_point_weight point_weight coarse_entropy_weight entropy_weight"

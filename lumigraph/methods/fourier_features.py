@@ -37,10 +37,10 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "tancik/fourier-feature-networks, 2d_image_regression.ipynb": (
+    "tancik/fourier-feature-networks, Experiments/2d_image_regression.ipynb (9c110c3)": (
         "encoding frequencies layers hidden_width learning_rate"
     ),
-    "tancik/fourier-feature-networks, Demo.ipynb": "scale",
+    "tancik/fourier-feature-networks, Demo.ipynb (9c110c3)": "scale",
 }
 
 

@@ -48,6 +48,19 @@ class Config(BaseConfig):
     exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where exposures are found to differ
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Müller 2022, table 1": "levels features_per_level",
+    "NVlabs/instant-ngp, configs/nerf/base.json (3612ea5)": (
+        "log2_hashmap_size base_resolution density_layers colour_layers sh_bands hidden_width learning_rate"
+    ),
+    "Müller 2022, sections 4 and 5.4": "geometry_features huber_delta",
+    "Müller 2022, appendix E": (
+        "samples_per_step transmittance_threshold occupancy_resolution occupancy_interval occupancy_decay "
+        "steps_per_diagonal"
+    ),
+}
+
+
 class InstantNGP(FieldMethod):
     """A hash table sampled in occupied cells, or where proposals are in scenes without bounds."""
 

@@ -41,11 +41,13 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "google/mipnerf, internal/models.py": (
+    "google/mipnerf, internal/models.py (84c969e)": (
         "depth position_frequencies direction_frequencies hidden_width coarse_samples fine_samples resample_padding"
     ),
-    "google/mipnerf, internal/utils.py": "rays_per_step coarse_loss_weight learning_rate final_learning_rate warmup",
-    "google/mipnerf, internal/models.py, which has no such step": "occupancy_resolution",
+    "google/mipnerf, internal/utils.py (84c969e)": (
+        "rays_per_step coarse_loss_weight learning_rate final_learning_rate warmup"
+    ),
+    "google/mipnerf, internal/models.py (84c969e), which has no such step": "occupancy_resolution",
 }
 
 

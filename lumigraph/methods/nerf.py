@@ -53,13 +53,15 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "bmild/nerf, run_nerf.py": (
+    "bmild/nerf, run_nerf.py (14c5556)": (
         "depth skip_layer position_frequencies direction_frequencies hidden_width networks coarse_loss_weight"
     ),
-    "bmild/nerf, paper_configs/blender_config.txt": "coarse_samples fine_samples learning_rate final_learning_rate",
-    "bmild/nerf, paper_configs/llff_config.txt": "density_noise",
+    "bmild/nerf, paper_configs/blender_config.txt (14c5556)": (
+        "coarse_samples fine_samples learning_rate final_learning_rate"
+    ),
+    "bmild/nerf, paper_configs/llff_config.txt (14c5556)": "density_noise",
     "Mildenhall 2020, section 5.3": "rays_per_step",
-    "bmild/nerf, run_nerf.py, which has no such step": "occupancy_resolution transmittance_threshold",
+    "bmild/nerf, run_nerf.py (14c5556), which has no such step": "occupancy_resolution transmittance_threshold",
 }
 
 

@@ -135,6 +135,17 @@ class Config(BaseConfig):
     own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Martin-Brualla 2021, supplement": (
+        "field depth position_frequencies hidden_width rays_per_step transient_layers transient_width beta_min "
+        "transient_start"
+    ),
+    "rover-xingyu/Ha-NeRF, issue 31": "coarse_samples fine_samples",
+    "kwea123/nerf_pl, opt.py (2dd2759)": "appearance_code transient_code",
+    "kwea123/nerf_pl, losses.py (2dd2759)": "transient_weight",
+}
+
+
 HIDDEN, SHOWN = "hidden", "shown"
 
 

@@ -56,7 +56,7 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "google-research/multinerf, internal/train_utils.py": "epsilon huber_delta exposure_scales",
+    "google-research/multinerf, internal/train_utils.py (5b4d4f6)": "epsilon huber_delta exposure_scales",
 }
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen
 DEFAULT_APERTURE = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture

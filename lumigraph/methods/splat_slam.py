@@ -81,6 +81,16 @@ class Config(BaseConfig):
     max_gaussians: CloudSize = 4_000_000  # Gaussians at most; what is seen after that is not mapped
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "spla-tam/SplaTAM, configs/replica/splatam.py (da6bbcd)": (
+        "first_estimate tracking_iterations rotation_rate shift_rate tracking_silhouette mapping_iterations "
+        "first_iterations window keyframe_every depth_weight colour_weight means_lr final_means_lr sh_lr opacities_lr "
+        "scales_lr frame_side"
+    ),
+    "spla-tam/SplaTAM, scripts/splatam.py (da6bbcd)": "ssim_weight",
+}
+
+
 class SplatSlam(Method):
     """One step is one frame: estimate its pose by gradient descent through the Gaussians, add Gaussians in newly seen
     regions, then optimise all of them. Gaussians are isotropic with one colour. Steps after the last frame continue

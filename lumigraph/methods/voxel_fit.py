@@ -50,6 +50,11 @@ class Config(BaseConfig):
     final_learning_rate: LearningRate = 0.03  # at the end of the budget
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "sunset1995/DirectVoxGO, configs/default.py (341e1fc)": "voxels initial_opacity step_size",
+}
+
+
 MAX_SMOOTHED = 1 << 12  # voxels of a step whose variation counts
 MESH_BLUR = 0.6  # voxels of deviation by which occupancy is smoothed for a mesh
 CLEAR = 3.0  # logits beyond which a voxel is as good as full, or empty

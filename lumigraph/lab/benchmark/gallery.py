@@ -6,6 +6,7 @@ OUTPUT/
 └── runs/, results.json, results.md    as of every benchmark
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -210,7 +211,8 @@ def write_gallery(cells: Sequence[Cell], output: Path) -> None:
         if cards := "".join(card(name, piece, found[name], output) for name, piece in section.items() if name in found):
             body += f"<section><h2>{escape(title)}</h2><div class='gallery'>{cards}</div></section>"
     trained = sorted({row["trained_on"] for row in found.values() if not row["failed"]})
-    files.write_bytes(output / PAGE, page("Gallery", body, " · ".join(trained)), "benchmark")
+    load = f"load {os.getloadavg()[2]:.1f} over a quarter of an hour" if hasattr(os, "getloadavg") else ""
+    files.write_bytes(output / PAGE, page("Gallery", body, " · ".join(filter(None, [*trained, load]))), "benchmark")
 
 
 def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
@@ -221,7 +223,8 @@ def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
         lines.append(f"failed: {escape(row['failed'])}")
     else:
         score = [f"{one.name} {one}" for one in scores_of(row)[:1]]
-        spent = f"{row['training_seconds']:.0f} s, {size(row['model_bytes'])}"
+        views = f" from {row['train_views']} views" if row.get("train_views") else ""
+        spent = f"{row['steps']} steps in {row['training_seconds']:.0f} s{views}, {size(row['model_bytes'])}"
         lines.append(" · ".join([*score, spent]))
         if path := picture_of(row, output):
             picture = f"<img src='{jpeg(path)}' alt='{escape(name)}'>"

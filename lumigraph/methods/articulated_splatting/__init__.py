@@ -48,7 +48,7 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "brown-ivl/manus, config/model/gaussian/gaussian.yaml": (
+    "brown-ivl/manus, config/model/gaussian/gaussian.yaml (4c981ad)": (
         "sh_degree ssim_weight densify_grad_threshold refine_every"
     ),
 }

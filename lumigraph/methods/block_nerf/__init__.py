@@ -63,6 +63,16 @@ class Config(BaseConfig):
     coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Tancik 2022, appendix": (
+        "field depth position_frequencies head_layers head_width coarse_samples fine_samples rays_per_step "
+        "exposure_frequencies visibility_layers visibility_width learning_rate final_learning_rate warmup_steps "
+        "pose_penalty final_pose_penalty coarse_loss_weight huber_delta"
+    ),
+    "hjxwhy/Block-NeRF, configs/waymo.yaml (bc16e5c), not the authors'": "hidden_width appearance_code",
+}
+
+
 OWN_SKIES = True  # a sky for each photograph behind open captures, by hash table
 FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 

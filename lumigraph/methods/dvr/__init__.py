@@ -28,7 +28,7 @@ from .fields import LOGIT_SCALE, OccupancyField, TableField
 
 MarchSteps = Annotated[int, between(4, 4096)]
 
-NORMAL_WEIGHT = 0.05  # weight of L_normal, which smooths the surface
+NORMAL_WEIGHT, HASH_NORMAL_WEIGHT = 0.1, 0.05  # weight of L_normal, which smooths the surface, by field
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,23 @@ class Config(BaseConfig):
                 f"--first-march-steps {self.first_march_steps} are more than the --march-steps {self.march_steps} in "
                 "the end; give fewer"
             )
+
+
+RELEASE = "autonomousvision/differentiable_volumetric_rendering"
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    f"{RELEASE}, configs/default.yaml (5a19010)": (
+        "colour_weight freespace_weight occupancy_weight depth_weight learning_rate"
+    ),
+    f"{RELEASE}, configs/multi_view_reconstruction/skull/ours_rgb.yaml (5a19010)": (
+        "rays_per_step normal_weight final_learning_rate"
+    ),
+    f"{RELEASE}, im2mesh/dvr/models/decoder.py (5a19010)": ("field hidden_width blocks"),
+    f"{RELEASE}, im2mesh/dvr/models/depth_function.py (5a19010)": (
+        "threshold march_steps first_march_steps secant_steps"
+    ),
+    f"{RELEASE}, im2mesh/dvr/models/__init__.py (5a19010)": ("neighbour_distance difference_step"),
+    f"{RELEASE}, im2mesh/dvr (5a19010), which has no such step": "hull_cells",
+}
 
 
 BLOCKS = 5  # residual blocks of the network
@@ -155,7 +172,8 @@ class DVR(SurfaceMethod):
         here = points.detach()
         shift = torch.rand(here.shape, generator=generator).to(here) - 0.5
         normals = (normalize(self._differences(x), dim=-1) for x in (here, here + c.neighbour_distance * shift))
-        terms["normal"] = NORMAL_WEIGHT * sum_of_lengths(*normals) / count
+        weight = HASH_NORMAL_WEIGHT if c.field == "hash" else NORMAL_WEIGHT
+        terms["normal"] = weight * sum_of_lengths(*normals) / count
         terms |= self._mask_terms(rays, t.detach(), inside, samples, generator)
         shown = self.background.repeat(count, 1).index_copy(0, met, rgb.detach())
         self.figures = {"mse": float((shown - batch.before(self.background)).square().mean()), "met": len(met) / count}

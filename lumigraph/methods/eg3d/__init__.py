@@ -106,6 +106,22 @@ class Config(BaseConfig):
             )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "NVlabs/eg3d, eg3d/train.py (7cf1fd1)": (
+        "coarse_samples fine_samples code style mapping_layers channel_base channel_most learning_rate "
+        "discriminator_rate density_weight density_distance density_interval swap_probability swap_pictures "
+        "blur_deviation blur_pictures average_pictures"
+    ),
+    "NVlabs/eg3d, eg3d/training/triplane.py (7cf1fd1)": "field plane_size plane_channels features decoder_width",
+    "NVlabs/eg3d, eg3d/training/superresolution.py (7cf1fd1)": "super_resolution super_widths",
+    "NVlabs/eg3d, eg3d/training/volumetric_rendering/ray_marcher.py (7cf1fd1)": "density_scale density_shift",
+    "NVlabs/eg3d, eg3d/training/training_loop.py (7cf1fd1)": "r1_interval",
+    "NVlabs/eg3d, docs/training_guide.md (7cf1fd1)": "rendering_size final_rendering_size pictures_per_step r1_weight",
+    "Chan 2022, sections 4 and 5": "picture_size growth_start",
+    "Chan 2021, supplement, of the generator with --field film": "film_width film_layers",
+}
+
+
 @dataclass(frozen=True)
 class AdversarialLesson:
     """Photographs with their cameras, and as many cameras of generated pictures."""

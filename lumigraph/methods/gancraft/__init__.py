@@ -88,6 +88,18 @@ class Config(BaseConfig):
     painter_adversary_learning_rate: LearningRate = 4e-4  # of the painter's adversary
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "NVlabs/imaginaire, configs/projects/gancraft/landscape.yaml (7e37171)": (
+        "features encoded bands output_features sky_bands style style_layers code samples_per_block sample_depth "
+        "density_scale crop label_window encoder_size encoder_width adversary_width gan_weight pseudo_gan_weight "
+        "l2_weight perceptual_weight kl_weight momentum learning_rate corner_learning_rate adversary_learning_rate"
+    ),
+    "NVlabs/imaginaire, configs/projects/spade/landscapes/lhq.yaml (7e37171)": "painter_code painter_width",
+    "NVlabs/imaginaire, imaginaire/generators/gancraft_base.py (6ef7ff0)": "hidden_width",
+    "NVlabs/imaginaire, configs/projects/gancraft/landscape.yaml (7e37171), which has no such term": "opacity_weight",
+}
+
+
 @dataclass(frozen=True)
 class WorldLesson:
     """A part of a camera's picture of the world, and landscapes.

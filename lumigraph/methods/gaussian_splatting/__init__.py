@@ -60,12 +60,12 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "graphdeco-inria/gaussian-splatting, arguments/__init__.py": (
+    "graphdeco-inria/gaussian-splatting, arguments/__init__.py (82bc469)": (
         "sh_degree ssim_weight means_lr final_means_lr sh_lr opacities_lr scales_lr quaternions_lr refine_every "
         "refine_from refine_until densify_grad_threshold opacity_reset_interval"
     ),
-    "graphdeco-inria/gaussian-splatting, train.py": "sh_degree_interval initialization strategy",
-    "graphdeco-inria/gaussian-splatting, train.py, which has no such step": (
+    "graphdeco-inria/gaussian-splatting, train.py (82bc469)": "sh_degree_interval initialization strategy",
+    "graphdeco-inria/gaussian-splatting, train.py (82bc469), which has no such step": (
         "half_resolution_until most_haste max_gaussians cap_ramp prune_near limit_scale limit_anisotropy "
         "observed_harmonics few_views antialiased filter_3d"
     ),

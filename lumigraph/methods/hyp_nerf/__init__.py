@@ -76,7 +76,7 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "hyp-nerf/HyP-NeRF, nerf/network_fcblock.py": (
+    "hyp-nerf/HyP-NeRF, nerf/network_fcblock.py (6ae0b3b)": (
         "log2_hashmap_size levels density_layers colour_layers shape_code colour_code code_deviation hyper_width "
         "hyper_layers hidden_width"
     ),

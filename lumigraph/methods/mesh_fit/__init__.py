@@ -59,7 +59,7 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "rgl-epfl/large-steps-pytorch, figures/comparison/generate_data.py": (
+    "rgl-epfl/large-steps-pytorch, figures/comparison/generate_data.py (1d72dc4)": (
         "start smoothness laplacian_weight normal_weight"
     ),
 }

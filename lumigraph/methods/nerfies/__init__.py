@@ -67,13 +67,27 @@ class Config(BaseConfig):
     backbone: BackboneNumbers = BackboneNumbers(
         NetworkNumbers(position_frequencies=8),  # the authors' release
         learning_rate=1e-3,  # section 4
-        final_learning_rate=1e-4,
+        final_learning_rate=1e-3 * 0.1**0.5,  # the release's: a tenth after twice its steps
     )
     rays: RayNumbers = RayNumbers(128, 128, rays_per_step=6144)  # section 4
     deformation: DeformationNumbers = DeformationNumbers()
     table_annealing: Share = 0.0  # share of the budget in which levels of the hash table join; 0: at once
     appearance_code: Code = 8  # numbers of a photograph's appearance, section 3.1; 0: all have the same
     deformation_rate: PositiveShare = 1.0  # share of the learning rate that the deformation and its codes learn at
+
+
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google/nerfies, configs/gpu_vrig_paper.gin (1a38512)": (
+        "field depth position_frequencies hidden_width coarse_samples fine_samples rays_per_step learning_rate "
+        "final_learning_rate elastic_weight background_weight"
+    ),
+    "google/nerfies, configs/defaults.gin (1a38512)": "motion moment_code deformation_frequencies",
+    "google/nerfies, configs/gpu_quarterhd.gin (1a38512), its 250 000 steps": "annealing elastic_until",
+    "google/nerfies, nerfies/configs.py (1a38512)": "appearance_code background_points",
+    "google/nerfies, nerfies/warping.py (1a38512)": "deformation_depth deformation_width deformation_skip",
+    "google/nerfies, nerfies/training.py (1a38512)": "elastic_scale",
+    "google/nerfies, nerfies/models.py (1a38512), which has no such part": "slice_dimensions slice_width",
+}
 
 
 class Nerfies(FieldMethod):

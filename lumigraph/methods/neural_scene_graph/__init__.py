@@ -58,11 +58,12 @@ class Config(BaseConfig):
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
 
 
+RELEASE = "princeton-computational-imaging/neural-scene-graphs"
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "princeton-computational-imaging/neural-scene-graphs, example_configs/config_kitti_0006_example_train.txt": (
+    f"{RELEASE}, example_configs/config_kitti_0006_example_train.txt (8d3d9ce)": (
         "rays_per_step code_width code_weight box_samples box_scale learning_rate"
     ),
-    "princeton-computational-imaging/neural-scene-graphs, main.py (8d3d9ce)": (
+    f"{RELEASE}, main.py (8d3d9ce)": (
         "field depth skip_layer position_frequencies direction_frequencies hidden_width pose_input symmetric "
         "huber_delta"
     ),

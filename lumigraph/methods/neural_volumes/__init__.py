@@ -68,6 +68,18 @@ class Config(BaseConfig):
         return 4 * (decoded + 4 * self.shared_resolution**3) * (2 if learning else 1)
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "facebookresearch/neuralvolumes, models/encoders/mvconv1.py (8c5fad4)": "encoder_size encoder_width code",
+    "facebookresearch/neuralvolumes, models/decoders/voxel1.py (8c5fad4)": (
+        "volume_resolution volume_width affines warp_resolution warp_width view_dependence"
+    ),
+    "Giogia/Neural-Scene-Rendering, experiments/dryice1/experiment1/config.py (666649f), a copy of the release's": (
+        "encoder_cameras samples moments_per_step rays_per_step divergence_weight opacity_weight smooth_weight "
+        "learning_rate"
+    ),
+}
+
+
 class NeuralVolumes(RayMethod):
     """An autoencoder of moments: from pictures of a few cameras to a volume that all cameras see."""
 

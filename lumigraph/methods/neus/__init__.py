@@ -71,6 +71,20 @@ class Config(BaseConfig):
             )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "Totoro97/NeuS, confs/wmask.conf (6e0a230)": (
+        "depth skip_layer colour_depth position_frequencies direction_frequencies hidden_width coarse_samples "
+        "fine_samples rays_per_step upsampling_rounds eikonal_weight mask_weight learning_rate final_learning_rate "
+        "warmup"
+    ),
+    "Totoro97/NeuS, confs/womask.conf (6e0a230)": "outside_samples cosine_annealing",
+    "Totoro97/NeuS, models/fields.py (6e0a230)": "field sharpness_rate",
+    "Totoro97/NeuS, models/renderer.py (6e0a230), which has no such step": (
+        "weight_threshold curvature_weight coarse_to_fine occupancy_resolution"
+    ),
+}
+
+
 class NeuS(FieldMethod):
     """A signed distance in the box of interest, seen through unbiased weights; around it density, in the open."""
 

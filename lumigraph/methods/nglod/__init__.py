@@ -54,10 +54,10 @@ class Config(BaseConfig):
 
 
 SOURCES = {  # of the numbers of `paper`; the others are ours
-    "nv-tlabs/nglod, sdf-net/lib/options.py": (
+    "nv-tlabs/nglod, sdf-net/lib/options.py (05e15f3)": (
         "features hidden_width base_level pool_points near_share fine_spread points_per_step learning_rate"
     ),
-    "nv-tlabs/nglod, sdf-net/README.md": "levels",
+    "nv-tlabs/nglod, sdf-net/README.md (05e15f3)": "levels",
 }
 
 

@@ -63,6 +63,17 @@ class Config(BaseConfig):
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of both tables, towards a density of 1
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "zju3dv/object_nerf, config/default_conf.yml (6b7e2f6)": (
+        "depth skip_layer position_frequencies direction_frequencies hidden_width object_layers object_width "
+        "instances code coarse_samples fine_samples rays_per_step object_colour_weight outside_weight guard_margin "
+        "learning_rate"
+    ),
+    "zju3dv/object_nerf, config/toy_desk_2.yml (6b7e2f6)": "object_opacity_weight",
+    "Yang 2021, sections 3.2 to 3.4": "field guided",
+}
+
+
 OBJECT_LAYERS, OBJECT_WIDTH = 4, 128  # hidden layers of the object branch's network, and their channels
 OBJECT_NETWORK = {"depth": OBJECT_LAYERS, "skip_layer": OBJECT_LAYERS // 2, "hidden_width": OBJECT_WIDTH}
 OBJECT_COLOUR_WEIGHT = 1.0  # weight of an instance's colours, eq. 6

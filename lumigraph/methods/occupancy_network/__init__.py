@@ -59,6 +59,17 @@ class Config(BaseConfig):
     code_steps: Annotated[int, between(0, 10_000)] = 0  # steps that fit an encoded cloud's code to it; many overfit
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "autonomousvision/occupancy_networks, configs/default.yaml (406f794)": "picture_size views",
+    "autonomousvision/occupancy_networks, configs/pointcloud/onet.yaml (406f794)": (
+        "code shapes_per_step cloud_points points_per_shape encoder_width threshold"
+    ),
+    "autonomousvision/occupancy_networks, im2mesh/onet/models/decoder.py (406f794)": "hidden_width blocks",
+    "autonomousvision/occupancy_networks, scripts/sample_mesh.py (406f794)": "near_share",
+    "autonomousvision/occupancy_networks, train.py (406f794)": "learning_rate",
+}
+
+
 PLAIN_SHARE = 0.25  # share of members that stay as they are where the others are warped: their codes are kept
 MAX_LOGIT_ERROR = 4.0  # beyond it a point of a cloud does not pull the surface: the decoder has no such part
 VALUE_SCALE = 0.02  # scene units for a logit of 1: about how steep occupancy is at a learnt surface

@@ -87,6 +87,16 @@ class Config(BaseConfig):
             )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "sxyu/pixel-nerf, conf/default.conf (91a044b)": (
+        "position_frequencies coarse_samples fine_samples depth_samples depth_deviation networks coarse_loss_weight"
+    ),
+    "sxyu/pixel-nerf, conf/default_mv.conf (91a044b)": "hidden_width blocks view_blocks",
+    "sxyu/pixel-nerf, src/util/args.py (91a044b)": "learning_rate",
+    "sxyu/pixel-nerf, train/train.py (91a044b)": "members_per_step rays_per_member",
+}
+
+
 @dataclass(frozen=True)
 class Sources:
     """Encoded photographs of one scene.

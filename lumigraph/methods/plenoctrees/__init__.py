@@ -68,6 +68,18 @@ class Config(BaseConfig):
     rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "sxyu/plenoctree, nerf_sh/config/blender.yaml (f0b8263)": "sh_bands",
+    "sxyu/plenoctree, nerf_sh/nerf/utils.py (f0b8263)": (
+        "field depth position_frequencies hidden_width sparsity_weight sparsity_length sparsity_points learning_rate "
+        "final_learning_rate"
+    ),
+    "sxyu/plenoctree, octree/extraction.py (f0b8263)": "octree_depth weight_threshold",
+    "sxyu/plenoctree, octree/config/syn_sh16.json (f0b8263)": "leaf_points",
+    "Yu 2021, section 4.2": "transmittance_threshold",
+}
+
+
 SKIP_LAYER = 5  # layer of the network whose activation the input is concatenated to again
 DENSITY_LEARNING_RATE, FINAL_DENSITY_LEARNING_RATE = 10.0, 1.0  # of the leaves, per scene unit
 HARMONICS_LEARNING_RATE, FINAL_HARMONICS_LEARNING_RATE = 0.02, 0.002  # of the leaves

@@ -38,6 +38,7 @@ INITIAL_DENSITY = 0.1  # density of all nodes at first, per unit of coordinates
 WEIGHT_THRESHOLD = 5e-3  # least weight of a voxel in a picture, section 3.3; higher prunes more
 TV_DENSITY = 1e-5  # weight of density's total variation, eq. 3; higher smooths
 TV_HARMONICS = 1e-3  # weight of harmonics' total variation, eq. 3; higher smooths
+DECAYED = 128 / 250  # the release's rates fall over 250 000 steps, of which 128 000 are taken
 OPEN_TV_DENSITY = 5e-4  # the same of density where there is no bound, the release's
 OPEN_TV_HARMONICS = 5e-3  # the same of harmonics where there is no bound
 
@@ -62,10 +63,10 @@ class Config(BaseConfig):
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # distance of samples in voxels; larger is faster, less exact
     rays_per_step: BatchSize = 5000  # rays in a step at most, section 4; more reduce noise, and cost time
     density_learning_rate: DensityRate = 30.0  # density's rate, for 256 voxels per axis; in proportion to these
-    final_density_learning_rate: DensityRate = 0.05  # density's rate at the end of the budget
+    final_density_learning_rate: DensityRate = 30 * (0.05 / 30) ** DECAYED  # density's rate at the end of the budget
     density_delay: Share = 0.12  # share of the budget in which density's rate rises; longer settles colours first
     harmonics_learning_rate: LearningRate = 1e-2  # rate of the harmonics at first
-    final_harmonics_learning_rate: LearningRate = 5e-6  # rate of the harmonics at the end of the budget
+    final_harmonics_learning_rate: LearningRate = 1e-2 * 5e-4**DECAYED  # rate of the harmonics at the end of the budget
     tv_share: PositiveShare = 0.01  # share of a step's nodes for total variation; more smooth more, and cost time
     tv_interval: Steps = 1  # steps between total variation terms; more are faster and smooth less
     sparsity: NonNegative = 1e-11  # weight of the Cauchy loss of density, eq. 4; higher empties more
@@ -86,6 +87,18 @@ class Config(BaseConfig):
         if unbounded:
             return self.open_base_resolution, self.open_max_resolution
         return self.base_resolution, self.max_resolution
+
+
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "sxyu/svox2, opt/configs/syn.json (ee80e2c)": (
+        "base_resolution max_resolution refine_until density_learning_rate harmonics_learning_rate tv_density "
+        "tv_harmonics"
+    ),
+    "sxyu/svox2, opt/opt.py (ee80e2c)": (
+        "initial_density rays_per_step final_density_learning_rate final_harmonics_learning_rate density_delay tv_share"
+    ),
+    "sxyu/svox2, opt/util/config_util.py (ee80e2c)": "step_size",
+}
 
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share

@@ -94,6 +94,21 @@ class Config(BaseConfig):
         )
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google-research/google-research, regnerf/configs/llff3.gin (30adf0e)": (
+        "depth_weight depth_weight_start depth_settling annealing forward_annealing_start density_noise gradient_clip "
+        "learning_rate final_learning_rate warmup"
+    ),
+    "google-research/google-research, regnerf/configs/dtu3.gin (30adf0e)": "annealing_start",
+    "google-research/google-research, regnerf/internal/configs.py (30adf0e)": (
+        "rays_per_step unseen_patches coarse_loss_weight resample_padding position_frequencies"
+    ),
+    "google-research/google-research, regnerf/internal/models.py (012c607)": (
+        "field depth hidden_width coarse_samples fine_samples"
+    ),
+}
+
+
 ANNEALING_START = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
 FINAL_TABLE_LEARNING_RATE = 1e-3  # learning rate of the hash table and its networks at the end
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls

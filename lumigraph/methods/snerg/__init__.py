@@ -82,6 +82,18 @@ class Config(BaseConfig):
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "google-research/google-research, snerg/configs/blender.yaml (2b41834)": (
+        "hidden_width sparsity_weight learning_rate final_learning_rate resolution"
+    ),
+    "google-research/google-research, snerg/nerf/utils.py (1a69739)": (
+        "field hidden_layers position_frequencies view_width block_size least_alpha"
+    ),
+    "google-research/google-research, snerg/train.py (2b41834)": "huber_delta",
+    "google-research/google-research, snerg/snerg/eval_and_refine.py (35a5be2)": "voxel_share",
+}
+
+
 FIELD, VOXELS, ATLAS = 0, 1, 2  # stages
 TAUGHT_VOXEL_SHARE = 0.7  # least share of the rest of the budget in which voxels of a teacher learn: they have no
 # features yet

@@ -52,12 +52,26 @@ class Config(BaseConfig):
     rays_per_member: BatchSize = 4096  # rays of each scene in a step; more reduce noise, and cost time
     targets: Annotated[int, between(1, 64)] = 1  # photographs of a member that a step's rays come from
     opacity_weight: NonNegative = 1.0  # of the squared error of opacity, beside that of colours, with alpha
-    learning_rate: LearningRate = 4e-5  # Adam's learning rate at first; higher learns faster, and may diverge
-    final_learning_rate: LearningRate = 4e-5  # learning rate at the end of the budget, reached exponentially
+    learning_rate: LearningRate = 5e-5  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     # Finding the code of one scene.
     code_steps: Annotated[int, between(0, 100_000)] = 1000  # steps that fit the code of a new scene; more take longer
     fit_rays: BatchSize = 1024  # rays of a step of that fit; more reduce noise, and cost time
+
+
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "vsitzmann/scene-representation-networks, srns.py (8165b50)": (
+        "code_deviation hyper_layers hidden_width depth pixel_layers depth_weight"
+    ),
+    "vsitzmann/scene-representation-networks, custom_layers.py (8165b50)": (
+        "marcher_state start start_distance start_deviation"
+    ),
+    "vsitzmann/scene-representation-networks, train.py (8165b50)": (
+        "code march_steps targets colour_weight code_weight learning_rate"
+    ),
+    "vsitzmann/scene-representation-networks, train_configs/chairs.yml (8165b50)": "members_per_step rays_per_member",
+}
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,18 @@ class Config(BaseConfig):
         return self.open_final_resolution if unbounded else self.final_resolution
 
 
+SOURCES = {  # of the numbers of `paper`; the others are ours
+    "apchenstu/TensoRF, configs/lego.txt (6a1e23b)": (
+        "factors density_components appearance_components initial_resolution final_resolution shading "
+        "feature_frequencies direction_frequencies rays_per_step weight_threshold l1_weight final_l1_weight"
+    ),
+    "apchenstu/TensoRF, opt.py (6a1e23b)": (
+        "appearance_features hidden_width density_scale step_ratio learning_rate final_learning_rate "
+        "network_learning_rate"
+    ),
+}
+
+
 # Shares of the budget at which the grid becomes finer: steps 2000, 3000, 4000, 5500 and 7000 of 30 000, section 5.
 UPSAMPLINGS = (1 / 15, 1 / 10, 2 / 15, 11 / 60, 7 / 30)
 SCHEDULE = GridSchedule((Stage(0.0, 1 / 4), Stage(0.03, 1 / 2), Stage(0.1, 1)), max_cells=1 << 18)
