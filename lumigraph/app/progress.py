@@ -27,6 +27,7 @@ from ..sfm.stages import StageMark
 from .job_record import Making
 from .jobs import log_lines, run_folder
 from .projects import SCENE, Item, changed_at, newest
+from .sharing import gaussians_of
 
 STAGES = {
     "features": "Finding details",
@@ -291,7 +292,7 @@ def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
     from ..run import Run, is_block_run
 
     if is_block_run(folder):
-        return {"method": "block-nerf", "psnr": None, "trained": True}
+        return {"method": "block-nerf", "psnr": None, "trained": True, "splats": False}
     run = Run(folder)
     held_out = (run.evaluation() or {}).get("psnr")
     return {
@@ -299,6 +300,7 @@ def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
         "psnr": held_out if held_out is not None else last_psnr(run.metrics()),
         "held_out": held_out is not None,
         "trained": run.has_state,
+        "splats": run.has_state and gaussians_of(folder) is not None,
         "photographs": run.frame.image_count,
     }
 

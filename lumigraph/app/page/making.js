@@ -94,7 +94,7 @@ function Progress({ detail, act, show }) {
   const left = progress.left ? `${nearly(progress.left)} left` : "";
   return html`<section class="panel" aria-label="Progress">
     <ol class="steps"><li class="done">Photographs</li><li class=${training ? "done" : "now"}>Cameras</li><li class=${training ? "now" : ""}>Training</li></ol>
-    <div class="line"><h2 role="status">${progress.stage}</h2><span>${share} %</span></div>
+    <div class="line"><h2><span role="status">${progress.stage}</span></h2><span>${share} %</span></div>
     <progress max="100" value=${share} aria-label=${progress.stage}></progress>
     <p class="faint">${left || " "}</p>
     <div class="row">
@@ -179,7 +179,7 @@ export function Findings({ detail, act, show }) {
   const again = (mapper) => act(() => api("POST", `${of(detail.key)}/make`, { quality: make?.quality || "draft", method: make?.method || "gaussian-splatting", mapper }));
   const directions = (result.findings || []).filter((one) => !one.photograph).slice(0, 3);
   return html`<section class="panel" aria-label="Findings"><h2>Photographs</h2>
-    <p>${result.placed} of ${result.given} placed<span class="faint"> · ${result.points.toLocaleString()} points · error ${result.error.toFixed(2)} pixels</span></p>
+    <p title=${`${result.points.toLocaleString()} points, error ${result.error.toFixed(2)} pixels`}>${result.placed} of ${result.given} placed</p>
     ${out.length > 0 && html`<details class="advanced"><summary>${counted(out.length, "photograph")} left out: why</summary>
       <ul>${out.map(([name, why]) => html`<li><strong>${name}</strong> ${why}</li>`)}</ul></details>`}
     ${result.warnings.map((text) => html`<p class="warning">${text}</p>`)}
