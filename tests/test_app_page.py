@@ -22,7 +22,7 @@ from test_app import PROGRAM, jpeg
 from waiting import until
 
 from lumigraph.app import uploads
-from lumigraph.app.projects import new_project
+from lumigraph.app.projects import items, new_project
 from lumigraph.app.server import Announcing, App, build
 from lumigraph.viewer.address import Address, free_port
 
@@ -257,11 +257,10 @@ def test_all_is_seen_named_and_reached_by_the_keyboard(served, page, faults, sch
 
 def test_a_scene_is_shown_as_its_page(served, page, faults):
     """Made at the first look; the viewer is behind another tab."""
-    item = new_project(served.root, "Garden")
-    (item.path / "runs").mkdir()
-    (item.path / "runs" / "cloud.spz").write_bytes(bytes(1800))
-    page.goto(f"{served.address.url}/#{item.key}")
+    page.goto(served.address.url)
+    page.get_by_role("button", name="See an example").click()
     page.get_by_text("Opening the scene").wait_for()
+    (item,) = items(served.root)
     (served.root / "go").touch()
     page.frame_locator("iframe").get_by_text("made").wait_for()
     assert page.get_by_role("tab", name="Edit").is_visible()

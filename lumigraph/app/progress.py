@@ -24,6 +24,7 @@ from ..geometry import evenly
 from ..metrics.rows import last_psnr
 from ..sfm.reconstruction import SNAPSHOTS
 from ..sfm.stages import StageMark
+from . import pace
 from .job_record import Making
 from .jobs import log_lines, run_folder
 from .projects import SCENE, Item, changed_at, newest
@@ -161,7 +162,7 @@ def capture_progress(item: Item) -> dict[str, Any]:
         stage = "Writing the scene"
     made = sum(WEIGHTS[name] for name in STAGES if name in done and done[name].done)
     spent = sum(done[name].seconds or 0.0 for name in STAGES if name in done and done[name].done)
-    left = spent / made * (1 - min(share, 1.0)) if made else None
+    left = (spent / made if made else pace.known().photograph * pace.given(item)) * (1 - min(share, 1.0))
     return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2], "left": left}
 
 

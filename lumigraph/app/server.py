@@ -217,6 +217,9 @@ class App:
         item = projects.new_project(self.root, body.title or (source.stem if source else "Scene"), source)
         return {"key": item.key}
 
+    def example(self) -> dict[str, Any]:
+        return {"key": projects.new_example(self.root).key}
+
     # One item
 
     def item(self, key: str) -> Item:
@@ -494,6 +497,7 @@ def build(app: App) -> ASGIApp:
         Route("/api/home", here.asked(None, app.home)),
         Route("/api/phone.svg", here.code),
         Route("/api/projects", here.asked(NewBody, app.new), methods=["POST"]),
+        Route("/api/example", here.asked(None, app.example), methods=["POST"]),
         Route("/api/trash", here.asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
         Route("/api/trash/{name}", here.restore, methods=["POST"]),
         Route(item, here.asked(None, app.detail)),

@@ -159,9 +159,9 @@ function Continue({ detail, act }) {
     ${score && html`<p>${score}${help}.</p>`}
     <div class="row">
       ${stopped && make.run && html`<button class="main" onClick=${() => more({})}>Go on</button>`}
-      ${!stopped && next && html`<button onClick=${() => more({ quality: next })}>More time: ${next}</button>`}
+      ${!stopped && next && (make || detail.kind === "run") && html`<button onClick=${() => more({ quality: next })}>More time: ${next}</button>`}
       ${!stopped && make?.seconds && html`<button onClick=${() => more({ minutes: (3 * make.seconds) / 60 })}>More time: ${lasting(3 * make.seconds)}</button>`}
-      ${detail.kind !== "run" && html`<button aria-expanded=${fresh} onClick=${() => setFresh(!fresh)}>Make it anew</button>`}
+      ${detail.photographs.length > 0 && detail.kind !== "run" && html`<button aria-expanded=${fresh} onClick=${() => setFresh(!fresh)}>Make it anew</button>`}
     </div>
     <details class="advanced"><summary>Details</summary><p class="faint">${[last?.method, last?.psnr && `${last.psnr.toFixed(1)} dB${last.held_out ? " held out" : " on training photographs"}`, make?.quality].filter(Boolean).join(" · ")}</p></details>
     ${fresh && html`<${Choose} detail=${detail} act=${act} uploading=${false} show=${() => {}} />`}
