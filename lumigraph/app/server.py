@@ -534,8 +534,11 @@ def build(app: App) -> ASGIApp:
 
 
 NO_FILE_NAME = str.maketrans(dict.fromkeys('<>:"/\\|?*', "-"))  # letters that no system takes in a name
-# A page that was made to share runs its program apart from the app's own address.
-SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
+# A page that was made to share runs its program apart from the app's own address, and reaches no network.
+SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; frame-ancestors 'self'"
+)
 SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}
 
 
