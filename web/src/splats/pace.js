@@ -32,7 +32,7 @@ export class Pace {
   // From a picture's milliseconds to the work that a moment allows.
   learn(milliseconds) {
     if (milliseconds > MOMENT) this.work = Math.max(LEAST, this.work * MOMENT / milliseconds);
-    else if (milliseconds < 0.7 * MOMENT) this.work = Math.min(1, this.work * 0.7 * MOMENT / milliseconds);
+    else if (milliseconds < 0.7 * MOMENT) this.work = Math.min(1, 1.1 * this.work);
   }
 
   // After each picture that the camera's movement asked for: how long until the next can be drawn.
