@@ -1,4 +1,5 @@
-"""A wheel in an empty environment: megabytes and seconds of the installation, of the import, and of the demo.
+"""A wheel in an empty environment: megabytes and seconds of the installation, of the import, and of the demo; what each
+extra would install, found by pip's dry run.
 
     make package
     python benchmarks/wheel.py dist/*.whl --output FOLDER [--torch torch==2.13.0] [--seconds 60]
@@ -16,12 +17,14 @@ import statistics
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 IMPORT = "import time; begin = time.perf_counter(); import lumigraph; print(time.perf_counter() - begin)"
 IMPORTS = 9
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"].keys() - {"dev"}
 # The command, with every file that Python opens written down.
 WATCHED = """import sys
 log = open({log!r}, "a")
@@ -72,6 +75,14 @@ def main() -> None:
         measured[f"{name}, MB"] = (after := megabytes(empty)) - before
         before = after
     measured["all, MB"] = before
+    for extra in sorted(EXTRAS):
+        said = run(
+            f"[{extra}]", python, "-m", "pip", "install", "--dry-run", "--quiet", "--report", "-", f"{wheel}[{extra}]"
+        )
+        names = sorted(
+            f"{each['metadata']['name']} {each['metadata']['version']}" for each in json.loads(said)["install"]
+        )
+        print(f"  {len(names)} packages more: {', '.join(names)}", flush=True)
     tries = [float(timed([python, "-c", IMPORT], environment, elsewhere)[1]) for _ in range(IMPORTS)]
     measured["import, first, s"], measured["import, median, s"] = tries[0], statistics.median(tries)
     log = output / "opened.txt"

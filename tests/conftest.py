@@ -49,6 +49,7 @@ shape_checks.install()
 from lumigraph.system.allocation import settle_memory
 
 gc.set_threshold(20_000)  # at 700, looking for cycles is a seventh of compiling and four fifths of parsing
+os.fsync = lambda file: None  # of a folder that the session removes; waiting for disks was 3 % of the contract
 settle_memory()  # as commands do: memory that one training step frees is kept for the next
 
 

@@ -35,9 +35,17 @@ from lumigraph.sfm.agreement import Agreement, agreement, still_share
 from lumigraph.sfm.coverage import use_of
 from lumigraph.sfm.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.sfm.georeference import georeference, upright
-from lumigraph.sfm.lenses import group_by_lens, prior, write_database
+from lumigraph.sfm.lenses import MODEL, group_by_lens, prior, write_database
 from lumigraph.sfm.options import MotionOptions
-from lumigraph.sfm.pairs import aggregated, alike, choose_matching, exhaustive, sequential
+from lumigraph.sfm.pairs import (
+    aggregated,
+    alike,
+    choose_matching,
+    choose_pairs,
+    exhaustive,
+    overlapping,
+    sequential,
+)
 from lumigraph.sfm.pairs import near as near_by
 from lumigraph.sfm.photos import Intake, Photo
 from lumigraph.sfm.reconstruction import Reconstruction, reconstruct
@@ -557,6 +565,47 @@ def test_photographs_of_one_place_are_alike():
     assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
     photos = [np.zeros((0, 128), np.uint8), *photos]
     assert np.isfinite(aggregated(photos.__getitem__, len(photos))).all()
+
+
+def test_a_first_look_leaves_out_pairs_that_share_little():
+    """Forty photographs around a thing share 60, 50, 40, 30, 20, 10 of their features with the six on each side: these
+    alone are compared. One without features is compared with all."""
+    chance = np.random.default_rng(0)
+    ring = chance.normal(size=(400, 128)).astype(np.float32)
+    seen = ring[(10 * np.arange(40)[:, None] + np.arange(70)) % 400]
+    seen += chance.normal(0, 0.2, seen.shape)
+    photos = seen / np.linalg.norm(seen, axis=2, keepdims=True)
+    assert overlapping(photos) == {
+        (min(i, j), max(i, j)) for i in range(40) for k in range(1, 7) for j in [(i + k) % 40]
+    }
+    photos[3, 5:] = 0
+    photos[7] = 0
+    found = overlapping(photos)
+    assert len([pair for pair in found if 7 in pair]) == 39 and {(2, 3), (3, 4)} <= found
+    counts = [demand.demand_of([photo("")] * 40, "exhaustive", 1600, 8192, preempt).pairs for preempt in (True, False)]
+    assert len(found) + len(sequential(40, 2)) <= counts[0] < counts[1] == 780
+
+
+@pytest.mark.parametrize("features", [2, 40])
+def test_poor_photographs_are_compared_with_all(tmp_path, monkeypatch, features):
+    """With few features, and where it is asked for, every pair is compared; with many those that share most."""
+    monkeypatch.setattr("lumigraph.sfm.pairs.MIN_LOOK_FEATURES", 20)
+    monkeypatch.setattr("lumigraph.sfm.pairs.MIN_SHARED", 0)
+    chance, names = np.random.default_rng(0), [f"{i:02d}.png" for i in range(30)]
+    write_database(tmp_path / "database.db", [[photo(name) for name in names]], MODEL)
+    with closing(pycolmap.Database.open(tmp_path / "database.db")) as opened:
+        for image in opened.read_all_images():
+            opened.write_keypoints(image.image_id, chance.uniform(1, 60, (features, 6)).astype(np.float32))
+            found = pycolmap.FeatureDescriptors(
+                pycolmap.FeatureExtractorType.SIFT, chance.integers(0, 90, (features, 128)).astype(np.uint8)
+            )
+            opened.write_descriptors(image.image_id, found)
+    nowhere = np.full((30, 3), np.nan)
+    chosen, every = (
+        choose_pairs("exhaustive", names, tmp_path / "database.db", nowhere, preempt=preempt)
+        for preempt in (True, False)
+    )
+    assert len(every) == 435 and (set(chosen) == set(every)) == (features < 20) and set(chosen) <= set(every)
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):

@@ -5,18 +5,20 @@ from __future__ import annotations
 import ast
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-import beartype
 import jaxtyping
+import numpy as np
 import pytest
 import shape_checks
 import torch
 from budgets import budget
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from shape_checks import JIT, PACKAGE, checked_modules, module_name, nodes, parsed
+from torch import Tensor
 
 import lumigraph
 from lumigraph.geometry import to_quaternion
@@ -436,20 +438,53 @@ def test_compiled_functions_stay_outside_the_shape_checks():
         )
 
 
-def test_first_calls_of_each_test_have_their_shapes_checked():
-    @jaxtyping.jaxtyped(typechecker=beartype.beartype)
-    def double(x: Float[torch.Tensor, "row 3"]) -> Float[torch.Tensor, "row 3"]:
-        return 2 * x
+@jaxtyping.jaxtyped(typechecker=None)
+def double(x: Float[torch.Tensor, "row 3"]) -> Float[torch.Tensor, "row 3"]:
+    return 2 * x
 
+
+@jaxtyping.jaxtyped(typechecker=None)
+@dataclass
+class Pairs:
+    left: Float[torch.Tensor, "row 3"]
+    right: Float[torch.Tensor, "row 3"] | float
+
+
+def test_first_calls_of_each_test_have_their_shapes_checked():
     for function in (double, to_quaternion):
-        with pytest.raises(jaxtyping.TypeCheckError):
+        with pytest.raises(shape_checks.ShapeError, match=r"float32 \(2, 2\), not Float\[.*Tensor, "):
             function(torch.zeros(2, 2))
     for _ in range(shape_checks.CHECKED_CALLS):
         double(torch.zeros(4, 3))
     assert double(torch.zeros(2, 2)).shape == (2, 2)
     shape_checks.next_test()
-    with pytest.raises(jaxtyping.TypeCheckError):
+    with pytest.raises(shape_checks.ShapeError):
         double(torch.zeros(2, 2))
+    Pairs(torch.zeros(4, 3), right=2), Pairs(torch.zeros(4, 3), torch.zeros(4, 3))
+    with pytest.raises(shape_checks.ShapeError, match="row=4"):
+        Pairs(torch.zeros(4, 3), torch.zeros(2, 3))
+
+
+@pytest.mark.parametrize(
+    ("annotation", "right", "wrong"),
+    [
+        (Float[Tensor, "n 3"] | None, None, np.zeros((2, 3))),
+        (tuple[Int[Tensor, "n"], ...], (torch.arange(2), torch.arange(3)), (torch.arange(2), torch.zeros(3))),
+        (tuple[Float[Tensor, "n"], int], (torch.zeros(2), 1), (torch.zeros(2, 1), 1)),
+        (Sequence[Float[Tensor, "n"]], [torch.zeros(2), torch.zeros(3)], [torch.zeros(2), torch.zeros(3, 1)]),
+        (dict[str, Bool[Tensor, "n"]], {"a": torch.zeros(2).bool()}, {"a": torch.zeros(2)}),
+        (Float[Tensor, "{count}"], torch.zeros(7), torch.zeros(6)),
+    ],
+)
+def test_shapes_are_found_within(annotation, right, wrong):
+    def taken(x, count=7):
+        return x
+
+    taken.__annotations__["x"] = annotation
+    checked = shape_checks.first_calls(taken)
+    assert checked(right) is right
+    with pytest.raises(shape_checks.ShapeError, match="x is "):
+        checked(wrong)
 
 
 # The table of rooms in the documents follows FLOORS and docstrings.

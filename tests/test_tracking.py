@@ -31,7 +31,7 @@ from lumigraph.components.tracking.trajectory import (
 from lumigraph.components.training.shared_points import Seen, resected
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation.tracking import Followed, Tracked
+from lumigraph.evaluation.tracking import Followed, Tracked, drifted
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
 from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.readers.unposed import Unposed
@@ -300,6 +300,26 @@ def test_a_loop_is_found_where_the_path_says_so():
     torch.testing.assert_close(loops.motions[0], motion(here, beside), atol=0.02, rtol=0)
 
 
+def test_a_loop_that_does_not_help_is_refused():
+    """The same keyframes where the path has not drifted; and where it has, but poses of the pose graph fit worse: the
+    path stays, and the loop is forgotten."""
+    here, beside = steps(2, (0.03, 0.05, 0, 0.05, 0, 0.04))
+    away = steps(2, (0, 2.0, 0, 0, 0, 0))[1]
+    frames = [in_room(0, here), *(in_room(i, away) for i in range(1, 12)), in_room(12, beside)]
+    loops, poses = Loops(1.0), torch.stack([here, *[away] * 11, beside])
+    loops.places.alike = lambda frame, others: []  # type: ignore[method-assign]
+    assert not loops.find(frames[12], frames[:12], poses)
+    drifted = poses.clone()
+    drifted[:, :, 3] += 0.1 * torch.arange(13)[:, None] / 12
+    held = {frame.index: frame for frame in frames}
+    assert loops.find(frames[12], frames[:12], drifted)
+    closed = loops.close(held, drifted)
+    assert closed is not None and float((closed - poses)[12, :, 3].norm()) < 0.06 and len(loops.pairs) == 1
+    assert loops.find(frames[12], frames[:12], drifted) and len(loops.pairs) == 2
+    loops.closed = lambda keyframes, p: p + torch.arange(13)[:, None, None] * 0.1  # type: ignore[method-assign]
+    assert loops.close(held, drifted) is None and len(loops.pairs) == len(loops.motions) == 1
+
+
 def test_features_find_a_fast_camera_that_the_map_does_not():
     """10 cm and 5 degrees a frame, and a map that accepts and spoils all poses: each frame is found to 2 cm. A frame
     without features is lost and has no pose; the next one is found again."""
@@ -328,6 +348,23 @@ def test_fast_motion_is_said_once(metres):
         for count in range(1, 12):
             tracker.warn_of_speed(list(range(count)))
     assert [str(x.message)[:38] for x in said] == ["The camera moves by 7 cm and 0 degrees"] * (metres > 0.05)
+
+
+@pytest.mark.parametrize("metres", [0.0, 0.01, 0.15])
+def test_a_drift_is_said_without_true_poses(metres):
+    """Ten keyframes before a wall, ten that turn around, ten before the wall again, whose poses are off: by 15 cm along
+    its normal the path contradicts itself, by one it is within the sensor's error."""
+    there = steps(10, (0.0, 0.02, 0.0, 0.02, 0.0, 0.0))
+    poses = torch.stack([*there, *steps(10, (0.0, 0.6, 0.0, 0.0, 0.0, 0.0)), *there])
+    frames = [in_room(i, pose) for i, pose in enumerate(poses)]
+    tracker, scene = tracker_of(frames, poses[0])
+    poses[20:, :, 3] -= metres * poses[20:, :, 2]
+    for frame, pose in zip(frames, poses, strict=True):
+        tracker.trajectory.know(frame.index, pose, frame.index)
+        tracker.add_keyframe(frame)
+    scene.names, tracker.sequence = [f"f{i}" for i in range(30)], lambda data: list(range(30))  # type: ignore[method-assign]
+    said = drifted(SimpleNamespace(tracker=tracker), scene)
+    assert said.startswith("The path has drifted") == bool(said) == (metres > 0.1)
 
 
 def test_a_path_is_drawn_to_one_scale_with_its_loops():

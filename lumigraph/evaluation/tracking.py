@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 
 from .. import files
-from ..components.tracking.frames import order_of
+from ..components.tracking.frames import MIN_COMMON, order_of
+from ..components.tracking.loops import DRIFTED, drift, motion
 from ..components.tracking.trajectory import KNOWN, LOSSES, UNKNOWN
 from ..datasets.scene import Scene
 from ..errors import LumigraphWarning
@@ -31,6 +32,9 @@ DRIFT_FILE, PATH_FILE = "drift.svg", "path.svg"
 MIN_POSES = 3  # frames that errors are measured on
 MAX_STRETCHES = 3  # of lost frames that are named, the longest
 MAX_ATE = 0.01  # of the path, beyond which it is called inaccurate
+RETURNED_KEYFRAMES = 40  # keyframes, evenly spread, that are compared with earlier ones
+MIN_RETURNS = 4  # of them with enough in common with an earlier one, for a judgement
+REMEDY = "record more frames a second, or try --close-loops where the camera returns to a place"
 
 
 @dataclass(frozen=True)
@@ -149,8 +153,29 @@ def inaccurate(found: Tracked, names: Sequence[str]) -> str:
     worst = names[found.images[int(position_errors(found.poses, found.truth).argmax())]]
     return (
         f"The path that was found is off by {100 * errors.ate:.2g} cm, {100 * errors.ate / errors.path:.2g} % of its "
-        f"length, and by {100 * errors.largest:.2g} cm at {worst}; record more frames a second, or try --close-loops "
-        "where the camera returns to a place"
+        f"length, and by {100 * errors.largest:.2g} cm at {worst}; {REMEDY}"
+    )
+
+
+@torch.no_grad()
+def drifted(method: Any, scene: Scene) -> str:
+    """Sentence for keyframes whose depth contradicts that of earlier ones where the path returns; empty if it does not.
+    It needs no true poses."""
+    tracker, names = method.tracker, scene.names
+    poses = tracker.trajectory.poses
+    chosen = evenly([i for i in tracker.sequence(scene) if tracker.is_keyframe[i]], RETURNED_KEYFRAMES)
+    keyframes, found = [tracker.load_keyframe(scene, i) for i in chosen], []
+    for k, frame in enumerate(keyframes):
+        common = [frame.compared(x, motion(poses[x.index], poses[frame.index])).common for x in keyframes[: k // 2]]
+        if max(common, default=0.0) >= MIN_COMMON:
+            older = keyframes[common.index(max(common))]
+            found.append((drift(frame, older, poses), names[frame.index], names[older.index]))
+    if len(found) < MIN_RETURNS or (middle := sorted(found)[len(found) // 2][0]) < DRIFTED:
+        return ""
+    worst, frame, older = max(found)
+    return (
+        f"The path has drifted: where it returns, {100 * middle:.0f} % of a keyframe's points (median) are where an "
+        f"earlier one saw nothing, and {100 * worst:.0f} % of {frame} beside {older}; {REMEDY}"
     )
 
 
@@ -196,7 +221,8 @@ def write_tracking(
     followed = Followed.of(method, scene)
     about: dict[str, Any] = {"frames": len(scene), "known": len(found.images)} | figures
     about |= {"share": len(found.images) / len(scene), "lost": [scene.names[i] for i in found.lost]}
-    about["warnings"] = [sentence for sentence in (followed.sentence, inaccurate(found, scene.names)) if sentence]
+    fault = drifted(method, scene) if found.truth is None else inaccurate(found, scene.names)
+    about["warnings"] = [sentence for sentence in (followed.sentence, fault) if sentence]
     for sentence in about["warnings"]:
         warnings.warn(sentence, LumigraphWarning, stacklevel=2)
     if found.map:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from ..budget import lasting
 from ..errors import LumigraphError
 from ..system.memory import MAX_THREADS, free_memory, gigabytes
-from .pairs import LOOP_CANDIDATES, RETRIEVED_VIEWS, SEQUENTIAL_NEIGHBOURS, Matching, exhaustive, sequential
+from .pairs import LOOK_VIEWS, LOOP_CANDIDATES, RETRIEVED_VIEWS, SEQUENTIAL_NEIGHBOURS, Matching, exhaustive, sequential
 from .photos import Photo
 
 PROCESS_BYTES = 400_000_000  # of this process and COLMAP's before the first photograph
@@ -33,6 +33,7 @@ class Demand:
 
     size:     (width, height) of the largest photograph
     max_size: longer side in pixels for feature detection
+    preempt:  leave pairs that share little out, see `choose_pairs`
     """
 
     count: int
@@ -41,6 +42,7 @@ class Demand:
     max_size: int
     features: int
     threads: int
+    preempt: bool = False
 
     @property
     def reduced(self) -> float:
@@ -66,7 +68,8 @@ class Demand:
     def pairs(self) -> int:
         """Largest number of pairs to match."""
         if self.matching == "exhaustive" or self.count <= SEQUENTIAL_NEIGHBOURS:
-            return len(exhaustive(self.count))
+            pairs = len(exhaustive(self.count))
+            return min(pairs, (LOOK_VIEWS + 2) * self.count) if self.preempt else pairs
         if self.matching == "sequential":
             return len(sequential(self.count)) + LOOP_CANDIDATES * self.count
         return (RETRIEVED_VIEWS + SEQUENTIAL_NEIGHBOURS) * self.count * 2 // 3  # some are each other's
@@ -85,7 +88,8 @@ class Demand:
         """Sentence with memory and time, shown before the start."""
         width, height = self.size
         side = min(self.max_size, max(self.size))
-        kinds = {"exhaustive": "all", "sequential": "neighbours", "retrieval": "those that look alike"}
+        every = "those that share most" if self.preempt else "all"
+        kinds = {"exhaustive": every, "sequential": "neighbours", "retrieval": "those that look alike"}
         time = lasting(max(10 * math.ceil(self.seconds / 10), 10))
         return (
             f"{self.count:,} photographs of up to {width}x{height} pixels: {self.features:,} features each at {side:,} "
@@ -137,7 +141,9 @@ def fitted(asked: Demand, free: float) -> tuple[Demand, list[str]]:
     return found, cuts
 
 
-def demand_of(photos: Sequence[Photo], matching: Matching, max_size: int, features: int) -> Demand:
+def demand_of(
+    photos: Sequence[Photo], matching: Matching, max_size: int, features: int, preempt: bool = False
+) -> Demand:
     """Demand of photographs, with as many threads as the processor has."""
     size = max((photo.size for photo in photos), key=math.prod)
-    return Demand(len(photos), size, matching, max_size, features, min(os.cpu_count() or 1, MAX_THREADS))
+    return Demand(len(photos), size, matching, max_size, features, min(os.cpu_count() or 1, MAX_THREADS), preempt)

@@ -203,13 +203,14 @@ class Reconstruction:
         self.max_size = self.options.max_size * (2 if self.spherical else 1)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
         self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
+        self.preempt = self.options.matching != "exhaustive"
         budgets = (features for most, features in FEATURE_BUDGETS if len(self.photos) <= most)
         self.features = next(budgets, MIN_FEATURE_BUDGET)
         self.keys = self.make_keys()
 
     def fit(self, free: int) -> None:
         """Choose sizes that fit into free memory (bytes), and print memory and time."""
-        asked = demand_of(self.photos, self.matching, self.max_size, self.features)
+        asked = demand_of(self.photos, self.matching, self.max_size, self.features, self.preempt)
         chosen, cuts = fitted(asked, free)
         self.max_size, self.features = chosen.max_size, chosen.features
         self.keys = self.make_keys()
@@ -226,7 +227,8 @@ class Reconstruction:
             self.features,
         )
         places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
-        matching = key_of(features, self.matching, places, *(["moving"] if self.options.moving else []))
+        more = [name for name, on in (("moving", self.options.moving), ("every pair", not self.preempt)) if on]
+        matching = key_of(features, self.matching, places, *more)
         mapping = key_of(matching, self.options.mapper)
         result = key_of(OUTPUT_VERSION, mapping, intake_identity(self.intake))
         return {"features": features, "matching": matching, "mapping": mapping, "result": result}
@@ -261,7 +263,7 @@ class Reconstruction:
     ) -> None:
         """Detect features of photographs without any in a database, at the largest size that memory allows. contrast:
         factor on COLMAP's threshold"""
-        asked = replace(demand_of(self.photos, self.matching, max_size, features), count=len(names))
+        asked = replace(demand_of(self.photos, self.matching, max_size, features, self.preempt), count=len(names))
         chosen, _ = fitted(asked, free_memory())
         area = PIXELS_PER_FEATURE * features
         coarse = [p.name for p in self.photos if p.name in names and reduced_pixels(p.size, chosen.max_size) >= area]
@@ -304,9 +306,10 @@ class Reconstruction:
         return typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
-        """Match the chosen pairs; with `among`, those that include one of these photographs."""
+        """Match the chosen pairs; with `among`, those that include one of these photographs, none left out."""
         with counting("Choosing pairs"):
-            pairs = choose_pairs(self.matching, self.names, database, gps_positions(self.photos))
+            places = gps_positions(self.photos)
+            pairs = choose_pairs(self.matching, self.names, database, places, preempt=self.preempt and among is None)
         named = [(self.names[i], self.names[j]) for i, j in pairs]
         if among is not None:
             named = [(a, b) for a, b in named if a in among or b in among]

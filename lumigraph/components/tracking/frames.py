@@ -38,6 +38,11 @@ class Comparison:
     error: float = math.inf
 
     @property
+    def contradiction(self) -> float:
+        """Share of points in front of the other's depth, where that saw nothing, among those on it or in front."""
+        return self.front / max(self.near + self.front, 1e-9)
+
+    @property
     def agrees(self) -> bool:
         return self.common >= MIN_COMMON and self.near > MIN_AGREEMENT * self.common
 

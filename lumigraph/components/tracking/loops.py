@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from ...datasets.scene import Photograph
 from ...method import Part
 from ..training.bundle_adjustment import rotation_vector
 from ..training.shared_points import Seen, features, matched, resected
-from .frames import MIN_COMMON, DepthFrame
+from .frames import MIN_COMMON, MISSED, DepthFrame
 from .trajectory import Pose, apply_twists, relative
 
 THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
@@ -32,6 +33,8 @@ MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
 CANDIDATES = 3  # keyframes that a new one is compared with by features
 MIN_AGE = 10  # keyframes between the two ends of a loop
 MIN_INLIERS = 15  # matches that a loop's motion explains; dense depth must agree, too
+DRIFTED = 0.45  # contradiction of two keyframes at the poses of a path, from which on it has drifted between them
+MIN_JUDGED = 0.05  # share of points in common, from which on depth can contradict
 MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
@@ -104,12 +107,14 @@ class Loops(Part):
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], poses: Float[Tensor, "image 3 4"]) -> bool:
         """Search the place of a new keyframe among older ones, those that look alike or see most of its points at the
-        poses of now; True if found."""
+        poses of now; True if one is found from which the path has drifted."""
         old = older[:-MIN_AGE]
         common = [frame.compared(x, motion(poses[x.index], poses[frame.index])).common for x in old]
         near = sorted(range(len(old)), key=lambda i: -common[i])[:CANDIDATES]
         beside = [old[i] for i in near if common[i] >= MIN_COMMON]
         for other in {x.index: x for x in [*beside, *self.places.alike(frame, old)]}.values():
+            if drift(frame, other, poses) < DRIFTED:
+                continue
             found = resected(*self.places.of(other).matched_points(self.places.of(frame)), MIN_INLIERS)
             if found is not None and frame.compared(other, found).agrees:
                 pair = torch.tensor([[other.index, frame.index]]).to(self.pairs)
@@ -117,6 +122,24 @@ class Loops(Part):
                 self.motions = torch.cat([self.motions, found[None].to(self.motions)])
                 return True
         return False
+
+    def close(
+        self, frames: dict[int, DepthFrame], poses: Float[Tensor, "image 3 4"]
+    ) -> Float[Tensor, "keyframe 3 4"] | None:
+        """Poses of keyframes, in order, closed by all loops. None, and the latest loop is forgotten, where neighbours
+        and ends of loops then fit no better than before."""
+        keyframes, after = list(frames), poses.clone()
+        after[keyframes] = self.closed(keyframes, poses[keyframes])
+        pairs = [*pairwise(keyframes), *self.pairs.tolist()]
+
+        def error(poses: Tensor) -> float:
+            errors = [frames[b].compared(frames[a], motion(poses[a], poses[b])).error for a, b in pairs]
+            return sum(min(x, MISSED) for x in errors)
+
+        if error(after) < error(poses):
+            return after[keyframes]
+        self.pairs, self.motions = self.pairs[:-1], self.motions[:-1]
+        return None
 
     def closed(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> Float[Tensor, "keyframe 3 4"]:
         """Poses of keyframes optimised with all loops; the first one is fixed."""
@@ -133,6 +156,14 @@ def motion(first: Pose, second: Pose) -> Pose:
     """Pose of the second in the frame of the first."""
     turn, shift = relative(first, second)
     return torch.cat([turn, shift[:, None]], -1)
+
+
+def drift(frame: DepthFrame, older: DepthFrame, poses: Float[Tensor, "image 3 4"]) -> float:
+    """Contradiction of two frames' depth at these poses, the larger of both directions: 0 to 1. 1 if they have hardly
+    a point in common."""
+    ahead = frame.compared(older, motion(poses[older.index], poses[frame.index]))
+    back = older.compared(frame, motion(poses[frame.index], poses[older.index]))
+    return 1.0 if ahead.common < MIN_JUDGED else max(ahead.contradiction, back.contradiction)
 
 
 def optimised(

@@ -110,12 +110,14 @@ class Tracker(Part):
 
     @torch.no_grad()
     def close_loop(self, frame: DepthFrame, data: Scene) -> bool:
-        """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
-        keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
-        older = [self.load_keyframe(data, i) for i in keyframes if i != frame.index]
-        if self.loops is None or not self.loops.find(frame, older, self.trajectory.poses):
+        """Search a loop for the latest keyframe, and correct the trajectory. True if one was found and kept."""
+        frames = {i: self.load_keyframe(data, i) for i in self.sequence(data) if self.is_keyframe[i]}
+        older, poses = [x for x in frames.values() if x.index != frame.index], self.trajectory.poses
+        if self.loops is None or not self.loops.find(frame, older, poses):
             return False
-        self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
+        if (closed := self.loops.close(frames, poses)) is None:
+            return False
+        self.trajectory.place(list(frames), closed)
         return True
 
     @property
