@@ -1,7 +1,11 @@
 """A walk through the app in headless Chromium, as a person would: photographs or a video dropped, made into a scene,
 cropped, shared, and the page downloaded and opened. Screenshots of each step at desk and phone size, and times.
 
-    python benchmarks/app_walk.py PHOTOS_OR_VIDEO --output FOLDER [--minutes 1] [--frames 30] [--kill]
+    python benchmarks/app_walk.py PHOTOS_OR_VIDEO --output FOLDER [--minutes 1] [--frames 30] [--kill] [--axe FILE]
+
+At each step the page may not scroll sideways; messages of its console are printed. --axe runs that program
+(`npm install axe-core`, node_modules/axe-core/axe.min.js) at each step; findings that it calls serious or critical fail
+the walk.
 
 --kill ends the app by SIGKILL while photographs arrive, while photographs or frames are looked at, while features are
 found, while cameras are placed, while it trains, while the scene is open, while its views are compared and while a
@@ -60,6 +64,7 @@ class Walk:
         self.times: dict[str, float] = {}
         self.app: subprocess.Popen[bytes] | None = None
         self.faults: list[str] = []
+        self.axe = ""  # source of axe-core
         self.begun = 0.0
 
     def start(self, *options: str) -> None:
@@ -109,7 +114,13 @@ class Walk:
         print(f"{self.times[step]:8.1f} s  {step}", flush=True)
 
     def shot(self, page: Any, name: str) -> None:
-        """Save a screenshot as JPEG of at most PICTURE_BYTES."""
+        """Save a screenshot as JPEG of at most PICTURE_BYTES, and note what is wrong with the page."""
+        if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+            self.faults.append(f"{name} scrolls sideways")
+        if self.axe:
+            page.evaluate(self.axe)
+            found = page.evaluate("axe.run(document, { iframes: false })")["violations"]
+            self.faults += [f"{name}: {one['help']}" for one in found if one["impact"] in ("serious", "critical")]
         image = Image.open(io.BytesIO(page.screenshot(timeout=600_000))).convert("RGB")
         for quality in (88, 80, 70, 55):
             image.save(out := io.BytesIO(), "JPEG", quality=quality)
@@ -118,7 +129,7 @@ class Walk:
         (self.output / f"{name}.jpg").write_bytes(out.getvalue())
 
     def shots(self, desk: Any, phone: Any, name: str, panel: str = "", scene: str = "") -> None:
-        """Save screenshots at both sizes. panel: shown on the phone; scene: title of its viewer, once that is open"""
+        """Save screenshots at both sizes. panel: shown on the phone; scene: selector of what shows that it is open"""
         give_way()
         self.shot(desk, f"{name}-desk")
         place = desk.url
@@ -130,14 +141,13 @@ class Walk:
             with contextlib.suppress(PlaywrightError):  # it leaves the page when the work ends
                 phone.get_by_label(panel, exact=True).scroll_into_view_if_needed(timeout=10_000)
         if scene:
-            phone.frame_locator("iframe").get_by_text(scene).first.wait_for(state="attached")
-            phone.wait_for_timeout(15_000)
+            phone.frame_locator("iframe").locator(scene).wait_for()
         phone.wait_for_timeout(5000)
         self.shot(phone, f"{name}-phone")
         phone.goto("about:blank")
         if scene:
             desk.goto(place)
-            desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
+            desk.frame_locator("iframe").locator(scene).wait_for()
 
 
 def give_way() -> None:
@@ -178,6 +188,9 @@ def windows(walk: Walk, arguments: Sequence[str] = ()) -> Iterator[tuple[Any, An
             page.add_init_script(NO_CARD_NAME)
             page.set_default_timeout(1000 * walk.patience)
             page.on("dialog", lambda dialog: dialog.accept())  # "leave the page?" while files arrive
+            page.on(
+                "console", lambda message: message.type == "log" or print(message.type, message.text[:200], flush=True)
+            )
             page.on("pageerror", lambda error: walk.faults.append(str(error)))
         give_way()
         yield desk, phone
@@ -209,6 +222,9 @@ def go(walk: Walk, files: list[Path], advanced: dict[str, float], kill: bool) ->
             desk.get_by_text("Advanced").click()
         for label, value in advanced.items():
             desk.get_by_label(label).fill(str(value))
+        print(
+            "         told:", desk.get_by_role("radiogroup", name="Quality").inner_text().replace("\n", " "), flush=True
+        )
         desk.get_by_role("button", name="Make the scene").click()
         walk.mark("asked to make it")
         stages(walk, desk, phone, key, kill)
@@ -257,7 +273,7 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
     walk.mark("all cameras are placed")
     until(lambda: making()["progress"].get("step", 0) > 20 or making()["state"] == "done", walk.patience)
     desk.get_by_role("tab", name="Scene").click()
-    desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
+    desk.frame_locator("iframe").get_by_text("Controls").wait_for()
     walk.mark("first picture of the scene")
     if kill:
         step = making()["progress"].get("step", 0)
@@ -272,23 +288,23 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
 def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
     """From a scene to a page of a part of it, downloaded and opened."""
     scene = desk.frame_locator("iframe")
-    scene.get_by_role("tab", name="Crop").wait_for()
+    scene.locator("body.open").wait_for()
     if kill:
         kill_at_rest(walk, desk, key)
-    desk.wait_for_timeout(20_000)
     walk.mark("the finished scene is open")
-    run = walk.detail(key)["runs"][-1]["name"]
-    walk.shots(desk, phone, "6-scene", scene=run)
+    desk.wait_for_timeout(5000)
+    walk.shots(desk, phone, "6-scene", scene="body.open")
+    desk.get_by_role("tab", name="Edit").click()
     scene.get_by_role("tab", name="Crop").click()
     scene.get_by_label("Show", exact=True).filter(visible=True).first.click()
     scene.get_by_role("option", name="inside a sphere").click()
     desk.wait_for_timeout(10_000)
     walk.shot(desk, "7-crop-desk")
     scene.get_by_role("button", name="Save", exact=True).filter(visible=True).first.click()
-    part = until(lambda: next((one for one in walk.detail(key)["runs"] if one["name"].endswith("-part")), None), 600)
+    until(lambda: next((one for one in walk.detail(key)["runs"] if one["name"].endswith("-part")), None), 600)
     walk.mark("the crop is saved")
-    desk.get_by_label("Version").filter(has_text=part["name"]).wait_for()
-    desk.get_by_role("button", name="Make Web page").click()
+    desk.get_by_label("Version").filter(has_text="a part").wait_for()
+    desk.get_by_role("tab", name="Scene").click()  # makes its page
     if kill:
         desk.get_by_text("Making").wait_for()
         walk.kill("the page is made", desk)
@@ -324,7 +340,7 @@ def kill_at_rest(walk: Walk, desk: Any, key: str) -> None:
     if (after := [run["name"] for run in walk.detail(key)["runs"]]) != before:
         raise SystemExit(f"The scene had {before} and has {after}")
     desk.get_by_role("tab", name="Scene").click()
-    desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
+    desk.frame_locator("iframe").locator("body.open").wait_for()
 
 
 def main() -> None:
@@ -334,6 +350,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="of training")
     parser.add_argument("--frames", type=int, help="of a video")
     parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--axe", type=Path, help="axe.min.js")
     parser.add_argument("--port", type=int, default=8931)
     parser.add_argument("--patience", type=float, default=1800.0, help="seconds for each step")
     given = parser.parse_args()
@@ -341,6 +358,7 @@ def main() -> None:
     files = [place] if place.is_file() else sorted(path for path in place.iterdir() if not path.name.startswith("."))
     given.output.mkdir(parents=True, exist_ok=True)
     walk = Walk(given.output, given.port, given.patience)
+    walk.axe = given.axe.read_text("utf-8") if given.axe else ""
     walk.start()
     try:
         fields = {"Minutes of training": given.minutes, "Frames of the video": given.frames}

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import uvicorn
+from accessible import faults_of
 from app_uploads import UPLOAD_NAMED
 from app_walk import drop
 from budgets import budget
@@ -21,7 +22,7 @@ from test_app import PROGRAM, jpeg
 from waiting import until
 
 from lumigraph.app import uploads
-from lumigraph.app.projects import new_project
+from lumigraph.app.projects import items, new_project
 from lumigraph.app.server import Announcing, App, build
 from lumigraph.viewer.address import Address, free_port
 
@@ -229,6 +230,44 @@ def test_the_page_is_labelled_and_fits_a_phone(served, page, faults):
     page.emulate_media(color_scheme="light")
     assert dark != page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert faults == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_is_seen_named_and_reached_by_the_keyboard(served, page, faults, scheme):
+    page.emulate_media(color_scheme=scheme)
+    item = new_project(served.root, "Garden")
+    for i in range(3):
+        (item.photographs / f"{i}.jpg").write_bytes(jpeg(i, (160, 120)))
+    page.goto(served.address.url)
+    page.get_by_label("More for Garden").click()
+    assert faults_of(page) == []
+    page.goto(f"{served.address.url}/#{item.key}")
+    page.get_by_text("3 photographs").wait_for()
+    page.get_by_text("Advanced").click()
+    assert faults_of(page) == []
+    page.evaluate("""() => {
+      const worse = new CSSStyleSheet();
+      worse.replaceSync(".faint { color: #777 } * { outline: none !important }");
+      document.adoptedStyleSheets = [worse];
+    }""")
+    found = faults_of(page)
+    assert any("contrast" in one for one in found) and any("focus" in one for one in found)
+    assert faults == []
+
+
+def test_a_scene_is_shown_as_its_page(served, page, faults):
+    """Made at the first look; the viewer is behind another tab."""
+    page.goto(served.address.url)
+    page.get_by_role("button", name="See an example").click()
+    page.get_by_text("Opening the scene").wait_for()
+    (item,) = items(served.root)
+    (served.root / "go").touch()
+    page.frame_locator("iframe").get_by_text("made").wait_for()
+    assert page.get_by_role("tab", name="Edit").is_visible()
+    assert page.get_by_role("link", name="Download Web page").is_visible()
+    page.reload()
+    page.frame_locator("iframe").get_by_text("made").wait_for()
+    assert (item.path / "calls.txt").read_text().count("export web") == 1 and faults == []
 
 
 def test_a_title_of_any_length_fits_and_is_changed_beside_the_scene(served, page, faults):

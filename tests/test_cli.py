@@ -180,14 +180,6 @@ def test_bad_input_gets_one_sentence(photographs, trained, tmp_path, monkeypatch
     assert [sorted(folder.rglob("*")) for folder in folders] == before and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["train"], ["eval", "x", "--sav-images"], ["train", "voxel-grid"], ["export"]])
-def test_bad_options_leave_with_code_2(arguments, capsys):
-    with pytest.raises(SystemExit) as fault:
-        main(arguments)
-    told = capsys.readouterr()
-    assert fault.value.code == 2 and told.out == "" and "help" in told.err and "Traceback" not in told.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "answer"),
     [
@@ -195,18 +187,24 @@ def test_bad_options_leave_with_code_2(arguments, capsys):
         (["train", "splat", "x"], "did you mean gaussian-splatting?"),
         (["train", "nerf", "x", "--seconds", "ten"], "--seconds cannot be 'ten'; give it a number"),
         (["eval", "x", "--views", "1.5"], "--views cannot be '1.5'; give it a whole number"),
+        (["train", "nerf", "x", "--learning-rate", "many"], "--learning-rate cannot be 'many'; give it a number"),
+        (["train", "nerf", "x", "--quality", "fine"], "--quality cannot be 'fine'; choose one of best, draft, good"),
+        (["train"], "`lumigraph train` needs METHOD and SCENE; `lumigraph train --help` lists"),
+        (["train", "voxel-grid"], "`lumigraph train` needs SCENE;"),
+        (["train", str(Path(__file__).parent)], "as in `lumigraph train gaussian-splatting "),
+        (["train", "nerf", "x", "y"], "`lumigraph train` does not know y; `lumigraph train --help` lists"),
+        (["export"], "`lumigraph export` needs one of collision, "),
+        (["export", "web", "x"], "`lumigraph export web` needs FILE.html;"),
+        (["export", "mesch", "x"], "`lumigraph export` does not know mesch; did you mean mesh?"),
+        (["eval", "x", "--sav-images"], "does not know --sav-images; did you mean --save-images?"),
+        (["compress", "x", "--output", "y", "--secnds", "4"], "--secnds; did you mean --seconds?"),
+        (["methods", "--nonsense"], "`lumigraph methods` does not know --nonsense; `lumigraph methods --help`"),
     ],
 )
 def test_a_wrong_word_is_answered_by_a_sentence(arguments, answer, capsys):
     assert main(arguments) == 2
-    assert answer in capsys.readouterr().err
-
-
-def test_a_wrong_option_is_compared_with_those_of_its_command(capsys):
-    with pytest.raises(SystemExit):
-        main(["compress", "x", "--output", "y", "--secnds", "4"])
-    told = capsys.readouterr().err
-    assert "--seconds" in told and "lumigraph compress --help" in told and "lumigraph train" not in told
+    told = capsys.readouterr()
+    assert answer in told.err and told.err.count("\n") == 1 and told.out == ""
 
 
 def test_a_traceback_on_request(tmp_path, monkeypatch):

@@ -161,8 +161,11 @@ def test_a_sealed_job_goes_on_and_a_changed_one_does_not(app, project):  # noqa:
     place.write_text(place.read_text().replace("gaussian-splatting", "instant-ngp"))
     assert app.runner.queue() == [] and read_job(item).make.state == "paused"
     jobs.make(item)
+    jobs.ask_to_share(item, sharing.ShareJob("a.html", "page", "a", "done", 1.0))
     shutil.copytree(item.path, app.root / "received")  # sealed by this user, at another place
     assert [task.item.key for task in app.runner.queue()] == [project]
+    pages = [read_job(find_item(app.root, key)).shares[0].state for key in (project, "received")]
+    assert pages == ["done", "failed"]  # a page opens by itself, but none that came with a project
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accessible import faults_of
 from budgets import budget
 from PIL import Image
 from tiny import method as tiny_method
@@ -28,8 +29,18 @@ from lumigraph.datasets.mesh import Mesh
 from lumigraph.exchange import write_gaussians
 from lumigraph.exchange.streamed_sog import Detail
 from lumigraph.export.options import PageOptions
-from lumigraph.export.page import WEB, contributions, mesh_page, splats_page, streamed_page, views, views_page
+from lumigraph.export.page import (
+    WEB,
+    contributions,
+    mesh_page,
+    moving_page,
+    splats_page,
+    streamed_page,
+    views,
+    views_page,
+)
 from lumigraph.gaussians import Gaussians
+from lumigraph.gaussians.moving import MovingGaussians
 from lumigraph.gaussians.splatting import render
 from lumigraph.paths import Surroundings
 from lumigraph.paths.opening import Opening, opening_of_scene
@@ -180,6 +191,47 @@ def test_without_webgl_a_sentence(tmp_path, page, faults):
     page.wait_for_selector("body.failed")
     assert "WebGL 2" in page.inner_text("#wait") and "another" in page.inner_text("#wait")
     assert len(faults) == 1
+
+
+LOSE = """async () => {
+  const canvas = document.querySelector("canvas");
+  const lost = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+  const happens = (name) => new Promise((done) => canvas.addEventListener(name, done, { once: true }));
+  const gone = happens("webglcontextlost");
+  lost.loseContext();
+  await gone;
+  const said = [document.body.className, document.getElementById("wait").textContent];
+  const back = happens("webglcontextrestored");
+  setTimeout(() => lost.restoreContext());
+  await back;
+  return said;
+}"""
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: splats_page(path, cloud(), OPENING),
+        lambda path: moving_page(path, MovingGaussians.still(cloud(), 2.0), OPENING),
+        lambda path: mesh_page(path, cube(), OPENING),
+    ],
+    ids=["splats", "moving", "mesh"],
+)
+def test_a_lost_graphics_card_comes_back(tmp_path, window, write):
+    write(tmp_path / "page.html")
+    opened = window(tmp_path / "page.html")
+    first = opened.settled()
+    said = opened.page.evaluate(LOSE)
+    assert "open" not in said[0].split() and "comes back" in said[1]
+    opened.page.locator("body.open").wait_for()
+    assert psnr(opened.settled(), first) > 45
+
+
+def test_a_page_is_named_and_reached_by_the_keyboard(tmp_path, page, faults):
+    moving_page(tmp_path / "page.html", MovingGaussians.still(cloud(), 2.0), OPENING)
+    page.goto((tmp_path / "page.html").as_uri())
+    page.evaluate("lumigraph.ready")
+    assert faults_of(page) == faults == []
 
 
 def cube() -> Mesh:

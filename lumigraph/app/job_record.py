@@ -97,10 +97,11 @@ def read_job(item: Item) -> JobRecord:
 
 
 def waiting(record: JobRecord) -> JobRecord:
-    """A record whose jobs wait for a button."""
+    """A record whose jobs wait for a button, pages too: the app opens those that it made itself."""
 
     def held_up(job: Any, state: JobState) -> Any:
-        return replace(job, state=state, fault=NOT_SEALED, process=0) if job.state in ("queued", "running") else job
+        waits = job.state in ("queued", "running") or (job.state == "done" and getattr(job, "kind", "") == "page")
+        return replace(job, state=state, fault=NOT_SEALED, process=0) if waits else job
 
     return JobRecord(record.make and held_up(record.make, "paused"), [held_up(one, "failed") for one in record.shares])
 

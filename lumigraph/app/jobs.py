@@ -235,7 +235,7 @@ class Runner:
             log.write(f"$ lumigraph {request.command}\n".encode())
             log.flush()
             task.child = request.start(self.program, stdout=log, stderr=subprocess.STDOUT)
-        if task.lane == SHARE and hasattr(os, "setpriority"):
+        if task.lane == SHARE and self.making and hasattr(os, "setpriority"):
             with contextlib.suppress(ProcessLookupError):
                 os.setpriority(os.PRIO_PROCESS, task.child.pid, SHARE_NICENESS)
         task.set(process=task.child.pid)

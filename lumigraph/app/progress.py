@@ -24,9 +24,11 @@ from ..geometry import evenly
 from ..metrics.rows import last_psnr
 from ..sfm.reconstruction import SNAPSHOTS
 from ..sfm.stages import StageMark
+from . import pace
 from .job_record import Making
 from .jobs import log_lines, run_folder
 from .projects import SCENE, Item, changed_at, newest
+from .sharing import gaussians_of
 
 STAGES = {
     "features": "Finding details",
@@ -160,7 +162,7 @@ def capture_progress(item: Item) -> dict[str, Any]:
         stage = "Writing the scene"
     made = sum(WEIGHTS[name] for name in STAGES if name in done and done[name].done)
     spent = sum(done[name].seconds or 0.0 for name in STAGES if name in done and done[name].done)
-    left = spent / made * (1 - min(share, 1.0)) if made else None
+    left = (spent / made if made else pace.known().photograph * pace.given(item)) * (1 - min(share, 1.0))
     return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2], "left": left}
 
 
@@ -291,7 +293,7 @@ def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
     from ..run import Run, is_block_run
 
     if is_block_run(folder):
-        return {"method": "block-nerf", "psnr": None, "trained": True}
+        return {"method": "block-nerf", "psnr": None, "trained": True, "splats": False}
     run = Run(folder)
     held_out = (run.evaluation() or {}).get("psnr")
     return {
@@ -299,6 +301,7 @@ def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
         "psnr": held_out if held_out is not None else last_psnr(run.metrics()),
         "held_out": held_out is not None,
         "trained": run.has_state,
+        "splats": run.has_state and gaussians_of(folder) is not None,
         "photographs": run.frame.image_count,
     }
 

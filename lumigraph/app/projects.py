@@ -32,6 +32,7 @@ PHOTOS, SCENE, RUNS, SHARED = "photos", "scene", "runs", "shared"
 APP_FOLDER, TRASH = ".lumigraph-app", "trash"
 SHELVES = "", RUNS, "scenes"  # folders whose folders are items
 SCENE_FILES = "transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy"  # of photographs with poses
+EXAMPLE = Path(__file__).parents[1] / "samples" / "still-life.sog"
 MAX_TITLE_LENGTH = 120  # letters
 WRITTEN = PHOTOS, "left-out", SCENE, RUNS, SHARED  # folders of an item that the app writes into
 PLAIN = r"[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*"  # name of one file or folder that is not hidden
@@ -205,6 +206,14 @@ def new_project(root: Path, title: str, source: Path | None = None) -> Item:
     with explained(item.path):
         (item.path / PHOTOS).mkdir(parents=True)
     item.keep(ProjectRecord(title, time.time(), str(source.resolve()) if source else "", str(item.path.resolve())))
+    return item
+
+
+def new_example(root: Path) -> Item:
+    """Make a project with a finished scene, which the package holds."""
+    item = new_project(root, "Example, a still life")
+    (item.path / RUNS).mkdir()
+    shutil.copyfile(EXAMPLE, item.path / RUNS / EXAMPLE.name)
     return item
 
 

@@ -9,8 +9,8 @@ from . import pictures, progress
 from .comparison import comparison, rendering
 from .folders import size_within
 from .job_record import Making, ShareJob, read_job
-from .jobs import log_lines
-from .projects import SCENE, SHARED, Item
+from .jobs import log_lines, run_folder
+from .projects import SCENE, SHARED, Item, changed_at
 
 MIN_PLACED_SHARE = 0.9  # of the photographs, below which the other mapper is offered
 MAX_MESSAGES = 30  # lines of a log on the page
@@ -48,7 +48,7 @@ def first_photograph(item: Item, until: float) -> tuple[Path | None, str]:
 def run_row(path: Path) -> dict[str, Any]:
     row = {"name": path.name, "bytes": size_within(path), "age": progress.age(path), "compared": None, "picture": ""}
     if not path.is_dir():
-        return row | {"method": path.suffix, "psnr": None, "trained": True}
+        return row | {"method": path.suffix, "psnr": None, "trained": True, "splats": True}
     picture = progress.picture_of_run(path)
     row |= progress.card_of_run(path) | {"picture": pictures.version_of(picture) if picture else ""}
     try:
@@ -72,8 +72,10 @@ def making_row(item: Item, job: Making) -> dict[str, Any]:
 
 
 def share_row(item: Item, share: ShareJob) -> dict[str, Any]:
-    place = item.path / SHARED / share.name
-    there = place.stat().st_size if share.state == "done" and place.is_file() else None
+    """State of a file to share. bytes: None before it is made, and where its run was trained further since"""
+    place, run = item.path / SHARED / share.name, run_folder(item, share.run)
+    fresh = share.state == "done" and place.is_file() and changed_at(place) >= changed_at(run / "checkpoints")
+    there = place.stat().st_size if fresh else None
     names = ("name", "kind", "run", "state", "fault")
     return {name: getattr(share, name) for name in names} | {"bytes": there}
 

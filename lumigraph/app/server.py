@@ -217,6 +217,9 @@ class App:
         item = projects.new_project(self.root, body.title or (source.stem if source else "Scene"), source)
         return {"key": item.key}
 
+    def example(self) -> dict[str, Any]:
+        return {"key": projects.new_example(self.root).key}
+
     # One item
 
     def item(self, key: str) -> Item:
@@ -494,6 +497,7 @@ def build(app: App) -> ASGIApp:
         Route("/api/home", here.asked(None, app.home)),
         Route("/api/phone.svg", here.code),
         Route("/api/projects", here.asked(NewBody, app.new), methods=["POST"]),
+        Route("/api/example", here.asked(None, app.example), methods=["POST"]),
         Route("/api/trash", here.asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
         Route("/api/trash/{name}", here.restore, methods=["POST"]),
         Route(item, here.asked(None, app.detail)),
@@ -530,8 +534,11 @@ def build(app: App) -> ASGIApp:
 
 
 NO_FILE_NAME = str.maketrans(dict.fromkeys('<>:"/\\|?*', "-"))  # letters that no system takes in a name
-# A page that was made to share runs its program apart from the app's own address.
-SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
+# A page that was made to share runs its program apart from the app's own address, and reaches no network.
+SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; frame-ancestors 'self'"
+)
 SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}
 
 

@@ -209,6 +209,8 @@ def parse(arguments: list[str]) -> Any:
         hidden = hidden_options(config) if {"--help", "-h"} & {*rest} and HELP_ALL not in rest else frozenset()
     if first == "train" and rest[:1] == ["captions"]:  # a model and no method
         commands[first] = importlib.import_module(".train_captions", __package__).TrainCaptions
+    if first == "train" and not named and len(rest) == 1 and Path(rest[0]).expanduser().exists():
+        raise LumigraphError(f"Name a method before {rest[0]}, as in `lumigraph train gaussian-splatting {rest[0]}`")
     if first in commands:  # alone: a wrong word is compared with its own options
         return check_command(understood(commands[first], f"lumigraph {first}", rest))
     if first and not first.startswith("-"):
@@ -222,18 +224,39 @@ def parse(arguments: list[str]) -> Any:
 
 
 def understood(kind: type, program: str, words: Sequence[str]) -> Any:
-    """The words as a command of a kind. Raises LumigraphError for a word in place of a number; leaves with code 2, and
-    tyro's explanation, for other ones that cannot be understood."""
+    """The words as a command of a kind. Raises LumigraphError for words that cannot be understood; leaves with code 2,
+    and tyro's explanation, where tyro gives a reason that `sentence_of` does not know."""
     words = ["--help" if x == HELP_ALL else x for x in words]
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(kind, prog=program, args=words, registry=RULES)
     except SystemExit:
-        flat = " ".join(re.sub("[│╭╮╰╯─]", " ", said.getvalue()).split())
-        if found := re.search(r"Error parsing (\S+): .*? from \[(.*?)\]", flat):
-            wanted = "a whole number" if "invalid literal for int" in flat else "a number"
-            wanted = wanted if "could not convert" in flat or "invalid literal" in flat else "what --help says of it"
-            raise LumigraphError(f"{found[1]} cannot be {found[2]}; give it {wanted}") from None
+        if sentence := sentence_of(" ".join(re.sub("[│╭╮╰╯─]|-{5,}", " ", said.getvalue()).split()), program):
+            raise LumigraphError(sentence) from None
         sys.stderr.write(said.getvalue())
         raise
+
+
+def sentence_of(said: str, program: str) -> str | None:
+    """One sentence for tyro's explanation of words that it cannot understand; None for a reason not known here."""
+    help_of = f"`{program} --help` lists what it takes"
+    if found := re.search(r"Error parsing (\S+): .*?(?:from \[|to float: )(.*?)(?:\]| Argument helptext)", said):
+        wanted = "a whole number" if "invalid literal for int" in said else "a number"
+        wanted = wanted if "could not convert" in said or "invalid literal" in said else "what --help says of it"
+        return f"{found[1]} cannot be {found[2]}; give it {wanted}"
+    if found := re.search(r"invalid choice (.*?) for argument '(.*?)'\. Expected one of \((.*?)\)", said):
+        choices = sorted(set(re.findall("'(.*?)'", found[3])) - {"None"})
+        return f"{found[2].split('/')[-1]} cannot be {found[1]}; choose one of {', '.join(choices)}"
+    if found := re.search(r"Missing from (.*?): (.*\(required\))", said):
+        names = [part.split()[0] for part in found[2].split("(required)") if part.strip()]
+        return f"`{found[1]}` needs {' and '.join(names)}; `{found[1]} --help` lists what it takes"
+    if found := re.search(r"Missing subcommand Expected one of \{(.*?)\}", said):
+        return f"`{program}` needs one of {found[1]} behind it; {help_of}"
+    if not (found := re.search(r"Unrecognized options: (\S+?)(?:,? |$)", said)):
+        return None
+    near = re.search("Perhaps you meant: (--[a-z0-9-]+)", said)
+    guess = near[1] if near else None
+    if there := re.search("Available subcommands: (.*?) For full helptext", said):
+        guess, help_of = meant(found[1], there[1].split(", ")), f"there are {there[1]}"
+    return f"`{program}` does not know {found[1]}; {f'did you mean {guess}?' if guess else help_of}"

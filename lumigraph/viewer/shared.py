@@ -91,7 +91,7 @@ class Subject:
     behind:         sky colours and floor of an unbounded scene
     exporter:       exports the scene; None if nothing can be exported
     set_scale:      stores units of exports per unit of the photographs' frame; None in training
-    embedded:       whether it is a part of the app's page: dark as its stage, the panel folded, no frusta at first
+    embedded:       whether it is a part of the app's page: dark as its stage, no frusta at first
     """
 
     title: str

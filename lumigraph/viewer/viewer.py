@@ -155,7 +155,7 @@ class Viewer:
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
         self._server = start_server(address, subject.label, subject.page)
-        self._aim()
+        self._aim(folded=subject.embedded and (training or not can(method, HasGaussians)))
         tabs = self._server.gui.add_tab_group()
         selects = subject.open_scene is not None and not training
         more = [*(["Select"] if selects else []), "Measure", "Path", *(["Export"] if subject.exporter else [])]
@@ -174,12 +174,12 @@ class Viewer:
         if subject.open_scene is not None:
             self._scenery.fill(subject.open_scene, self._filled)
 
-    def _aim(self) -> None:
-        """Set the appearance of the page, and the initial camera of every client."""
+    def _aim(self, folded: bool) -> None:
+        """Set the appearance of the page, and the initial camera of every client. folded: show the panel's bar alone"""
         server, subject = self._server, self.subject
         width, dark = ("small", True) if subject.embedded else ("medium", False)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width=width, dark_mode=dark)
-        if subject.embedded:
+        if folded:
             server.gui.main_panel.minimize()
         prepare_window(server.gui, subject.label)
         # No environment map: nothing here is lit, and viser fades the canvas in over frames once it has loaded

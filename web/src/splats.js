@@ -10,20 +10,25 @@ import { Stage } from "./stage.js";
 
 export async function start(settings, held) {
   const stage = new Stage(settings, { antialias: false });
-  const { gl, budget } = limits(stage, settings);
+  const budget = limit(stage, settings);
   if (settings.stream) {
     const { cloud, select } = await levels(stage, settings, budget);
-    await shown(stage, cloud, select, gl);
+    await shown(stage, cloud, select);
     return stage;
   }
-  const made = fromSpz(await inflated(settings.splats ? held.slice(0, settings.splats) : held));
+  const unpacked = async () => fromSpz(await inflated(settings.splats ? held.slice(0, settings.splats) : held));
+  const made = await unpacked();
   const moves = settings.splats ? motion(await inflated(held.slice(settings.splats)), made.count, ROW) : null;
   const placed = new Matrix4().makeScale(1, -1, -1); // .spz has y up and z back: half a turn around x
   const cloud = new Cloud(stage, { ...made, capacity: made.count, antialiased: settings.antialiased, placed, moves });
   cloud.hold(0, made);
+  stage.revive = async () => {
+    cloud.begin();
+    cloud.hold(0, await unpacked());
+  };
   const most = moves ? made.count : Math.min(budget, made.count);
   // Those with the largest contribution are first, except in clouds that move, of which few are there at a time.
-  const pace = await shown(stage, cloud, (share) => [[0, moves ? most : Math.ceil(share * most)]], gl);
+  const pace = await shown(stage, cloud, (share) => [[0, moves ? most : Math.ceil(share * most)]]);
   if (moves) {
     stage.setTime = async (seconds) => {
       pace.moving = true;
@@ -36,14 +41,15 @@ export async function start(settings, held) {
   return stage;
 }
 
-function limits(stage, settings) {
+function limit(stage, settings) {
   const gl = stage.renderer.getContext();
-  return { gl, budget: Math.min(budgetOf(settings), ROW * gl.getParameter(gl.MAX_TEXTURE_SIZE)) };
+  return Math.min(budgetOf(settings), ROW * gl.getParameter(gl.MAX_TEXTURE_SIZE));
 }
 
 // Has the stage paint a cloud: what is there in the order of before, and again once that of the new camera is found.
-// select(share): the ranges to draw, of so large a share of the budget. Resolves once there is a picture.
-async function shown(stage, cloud, select, gl) {
+// select(share): the ranges to draw, of so large a share of the budget. Resolves once there is a picture, a rough one: the
+// whole one follows.
+async function shown(stage, cloud, select) {
   const { paint, camera } = stage, seen = new Matrix4();
   const pace = new Pace(async () => {
     await stage.arranged();
@@ -66,18 +72,18 @@ async function shown(stage, cloud, select, gl) {
     cloud.choose(select(pace.share));
     const again = () => !cloud.sorting && cloud.arrange().then((found) => found && stage.redraw());
     if (cloud.count > 2 * cloud.chosen) return again(); // the picture of before stays until there are fewer
+    stage.draft(pace.density);
     paint();
-    cloud.paint(pace.scale);
+    cloud.paint();
     again();
     if (!pace.moving) return;
     const sharpening = pace.follow().finally(() => stage.sharpening === sharpening && (stage.sharpening = null));
     stage.sharpening = sharpening;
   };
-  await stage.arranged();
+  cloud.choose(select(pace.share));
+  await cloud.arrange();
   stage.paint();
-  const begin = performance.now();
-  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until it is drawn
-  pace.learn(performance.now() - begin);
+  cloud.finish();
   return pace;
 }
 

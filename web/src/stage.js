@@ -13,9 +13,10 @@ ColorManagement.enabled = false;
 export class Stage {
   constructor(settings, { antialias }) {
     this.settings = settings;
+    this.density = 1; // share of the screen's pixels on each side, for rough pictures
     this.renderer = new WebGLRenderer({ antialias, alpha: false, powerPreference: "high-performance" });
     this.renderer.outputColorSpace = LinearSRGBColorSpace; // no second encoding
-    this.renderer.setClearColor(new Color(...settings.background), 1);
+    this.clear();
     this.scene = new Scene();
     if (settings.sky) this.scene.add(sky(settings));
     this.camera = new PerspectiveCamera(50, 1, settings.near, settings.far);
@@ -23,11 +24,20 @@ export class Stage {
     this.paint = () => this.renderer.render(this.scene, this.camera);
     this.arranged = async () => {}; // to await: what must be put in order before a camera's picture is right
     this.sorted = async () => {}; // and what of that is under way
+    this.revive = async () => {}; // to await, once the context is back: further things on the graphics card
     this.sharpening = null; // while a coarse picture is shown, and a better one being drawn
 
     const canvas = this.renderer.domElement;
     canvas.tabIndex = 0;
+    canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", settings.title);
+    canvas.addEventListener("webglcontextlost", () => document.body.classList.remove("open"));
+    canvas.addEventListener("webglcontextrestored", async () => {
+      this.clear(); // three.js has forgotten it
+      await this.revive();
+      this.redraw();
+      document.body.classList.add("open");
+    });
     document.getElementById("stage").append(canvas);
 
     this.controls = new OrbitControls(this.camera, canvas);
@@ -49,6 +59,10 @@ export class Stage {
     this.resize();
   }
 
+  clear() {
+    this.renderer.setClearColor(new Color(...this.settings.background), 1);
+  }
+
   // Where the page begins, looking at what the photographs look at.
   reset() {
     this.angle = this.settings.angle;
@@ -61,8 +75,20 @@ export class Stage {
     this.redraw();
   }
 
+  // The browser enlarges a picture with fewer pixels than the screen has.
+  draft(density) {
+    if (density === this.density) return;
+    this.density = density;
+    this.renderer.setPixelRatio(density * ratio());
+  }
+
+  // Of the whole picture, pixels.
+  get height() {
+    return innerHeight * ratio();
+  }
+
   resize() {
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, DENSEST));
+    this.renderer.setPixelRatio(this.density * ratio());
     this.renderer.setSize(innerWidth, innerHeight);
     this.lens();
     this.redraw();
@@ -175,6 +201,8 @@ function sky({ sky: [overhead, underfoot], background, near, far }) {
   Object.assign(sphere, { frustumCulled: false, renderOrder: -1 });
   return sphere;
 }
+
+const ratio = () => Math.min(devicePixelRatio, DENSEST);
 
 // Until what was painted is on the screen.
 export function shown() {

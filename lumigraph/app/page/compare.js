@@ -1,7 +1,7 @@
 // Photographs beside their renderings, under a slider.
 
 import { html, useState } from "./preact.js";
-import { api, of, pictureUrl } from "./common.js";
+import { api, judged, of, pictureUrl } from "./common.js";
 
 export function Compare({ detail, run, act }) {
   const [chosen, choose] = useState("");
@@ -25,7 +25,7 @@ export function Compare({ detail, run, act }) {
       <input type="range" min="0" max="100" step="0.5" value=${at} aria-label="Photograph against rendering" onInput=${(event) => setAt(event.target.value)} />
     </div>
     <div class="row"><label><span class="hidden">Photograph</span><select value=${view.name} onChange=${(event) => choose(event.target.value)}>
-      ${views.map((one) => html`<option value=${one.name}>${one.name} · ${one.psnr.toFixed(1)} dB${one.held_out ? ", held out" : ""}</option>`)}</select></label>
+      ${views.map((one) => html`<option value=${one.name}>${one.name} · ${judged(one.psnr, one.held_out).toLowerCase()}${one.held_out ? ", not trained on" : ""}</option>`)}</select></label>
       ${(stale || busy) && make}</div>${fault}
   </div>`;
 }

@@ -80,17 +80,19 @@ function Drop({ home, choose, say, go }) {
       say(fault.message);
     }
   };
+  const example = () => api("POST", "example").then(({ key }) => go(key), (fault) => say(fault.message));
   return html`<section class=${small ? "drop small" : "drop"} aria-label="New scene">
     <div><h2>${small ? "New scene" : "Drop photographs, a folder or a video"}</h2>
     <p class="faint">${small
       ? "Drop photographs, a folder or a video anywhere on this page."
-      : `Walk around the thing and take 20 to 60 photographs, or film it for half a minute. They stay on ${home?.local === false ? "the machine of this app" : "this machine"}.`}</p></div>
+      : `Walk around the thing and take 20 to 60 photographs, or film it for half a minute. You get a scene to turn around, and can share it as a web page or a film. All stays on ${home?.local === false ? "the machine of this app" : "this machine"}.`}</p></div>
     <div class="row">
       <label class="button main">Choose photographs or a video
         <input type="file" multiple accept="image/*,video/*,.heic,.heif,.dng,.nef,.cr2,.cr3,.arw" onChange=${(event) => choose(event.target.files)} /></label>
       <label class="button">A folder
         <input type="file" webkitdirectory onChange=${(event) => choose(event.target.files)} /></label>
       ${home?.local && path === null && html`<button onClick=${() => setPath("")}>A path on this machine</button>`}
+      ${home && !small && html`<button onClick=${example}>See an example</button>`}
     </div>
     ${home && phone(home.phone)}
     ${path !== null && html`<form class="row" onSubmit=${open}>
@@ -125,7 +127,7 @@ function Card({ card, act, say, load, queue }) {
     <a href=${`#${encodeURIComponent(card.key)}`} aria-label=${`Open ${card.title}${state ? `, ${state}` : ""}`}>
       ${card.picture
         ? html`<img loading="lazy" alt="" src=${pictureUrl(card.key, { v: card.picture, side: 512 })} />`
-        : html`<div class="blank">${card.kind === "project" ? "no photographs yet" : card.kind}</div>`}
+        : html`<div class="blank">${card.kind === "project" ? (card.runs ? "a scene" : "no photographs yet") : card.kind}</div>`}
       ${state && html`<span class=${`badge ${card.state}`}>${state}</span>`}
     </a>
     <div class="line">

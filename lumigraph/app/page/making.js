@@ -94,7 +94,7 @@ function Progress({ detail, act, show }) {
   const left = progress.left ? `${nearly(progress.left)} left` : "";
   return html`<section class="panel" aria-label="Progress">
     <ol class="steps"><li class="done">Photographs</li><li class=${training ? "done" : "now"}>Cameras</li><li class=${training ? "now" : ""}>Training</li></ol>
-    <div class="line"><h2 role="status">${progress.stage}</h2><span>${share} %</span></div>
+    <div class="line"><h2><span role="status">${progress.stage}</span></h2><span>${share} %</span></div>
     <progress max="100" value=${share} aria-label=${progress.stage}></progress>
     <p class="faint">${left || " "}</p>
     <div class="row">
@@ -159,9 +159,9 @@ function Continue({ detail, act }) {
     ${score && html`<p>${score}${help}.</p>`}
     <div class="row">
       ${stopped && make.run && html`<button class="main" onClick=${() => more({})}>Go on</button>`}
-      ${!stopped && next && html`<button onClick=${() => more({ quality: next })}>More time: ${next}</button>`}
+      ${!stopped && next && (make || detail.kind === "run") && html`<button onClick=${() => more({ quality: next })}>More time: ${next}</button>`}
       ${!stopped && make?.seconds && html`<button onClick=${() => more({ minutes: (3 * make.seconds) / 60 })}>More time: ${lasting(3 * make.seconds)}</button>`}
-      ${detail.kind !== "run" && html`<button aria-expanded=${fresh} onClick=${() => setFresh(!fresh)}>Make it anew</button>`}
+      ${detail.photographs.length > 0 && detail.kind !== "run" && html`<button aria-expanded=${fresh} onClick=${() => setFresh(!fresh)}>Make it anew</button>`}
     </div>
     <details class="advanced"><summary>Details</summary><p class="faint">${[last?.method, last?.psnr && `${last.psnr.toFixed(1)} dB${last.held_out ? " held out" : " on training photographs"}`, make?.quality].filter(Boolean).join(" · ")}</p></details>
     ${fresh && html`<${Choose} detail=${detail} act=${act} uploading=${false} show=${() => {}} />`}
@@ -179,7 +179,7 @@ export function Findings({ detail, act, show }) {
   const again = (mapper) => act(() => api("POST", `${of(detail.key)}/make`, { quality: make?.quality || "draft", method: make?.method || "gaussian-splatting", mapper }));
   const directions = (result.findings || []).filter((one) => !one.photograph).slice(0, 3);
   return html`<section class="panel" aria-label="Findings"><h2>Photographs</h2>
-    <p>${result.placed} of ${result.given} placed<span class="faint"> · ${result.points.toLocaleString()} points · error ${result.error.toFixed(2)} pixels</span></p>
+    <p title=${`${result.points.toLocaleString()} points, error ${result.error.toFixed(2)} pixels`}>${result.placed} of ${result.given} placed</p>
     ${out.length > 0 && html`<details class="advanced"><summary>${counted(out.length, "photograph")} left out: why</summary>
       <ul>${out.map(([name, why]) => html`<li><strong>${name}</strong> ${why}</li>`)}</ul></details>`}
     ${result.warnings.map((text) => html`<p class="warning">${text}</p>`)}

@@ -1,7 +1,7 @@
 // Page of a scene: photographs, making, the scene itself, files to share.
 
 import { html, useEffect, useRef, useState } from "./preact.js";
-import { api, counted, of, repeat } from "./common.js";
+import { api, judged, of, repeat } from "./common.js";
 import { Cameras } from "./cameras.js";
 import { Compare } from "./compare.js";
 import { Findings, Making } from "./making.js";
@@ -93,14 +93,17 @@ export function Project({ item, say, choose, go }) {
   const capturing = make?.state === "running" && make.stage === "capture";
   const trained = detail.runs.filter((one) => one.trained);
   const shown = tab || (detail.live || (trained.length && !capturing) ? "scene" : model.cameras.length && make?.state !== "failed" ? "cameras" : "photographs");
+  const viewed = run || trained.at(-1)?.name || "";
+  const page = detail.shares.find((one) => one.kind === "page" && one.run === viewed);
+  const paged = detail.kind === "project" && !detail.live && page?.state !== "failed" && trained.some((one) => one.name === viewed && one.splats);
   const tabs = [
     ["scene", "Scene", detail.live || trained.length > 0],
+    ["edit", "Edit", paged],
     ["compare", "Compare", trained.some((one) => one.photographs) && !detail.live],
     ["cameras", "Cameras", model.cameras.length > 0],
     ["photographs", "Photographs", detail.kind !== "run"],
   ].filter(([, , there]) => there);
   const active = tabs.some(([name]) => name === shown) ? shown : tabs[0]?.[0];
-  const viewed = run || trained.at(-1)?.name || "";
   const keys = (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (!step) return;
@@ -125,13 +128,14 @@ export function Project({ item, say, choose, go }) {
         <div class="tabs" role="tablist" onKeyDown=${keys}>
           ${tabs.map(([name, title]) => html`<button role="tab" id=${`tab-${name}`} aria-selected=${active === name} aria-controls="stage"
             tabindex=${active === name ? 0 : -1} onClick=${() => setTab(name)}>${title}</button>`)}
-          ${["scene", "compare"].includes(active) && !detail.live && trained.length > 1 && html`<label class="versions"><span class="hidden">Version</span>
+          ${["scene", "edit", "compare"].includes(active) && !detail.live && trained.length > 1 && html`<label class="versions"><span class="hidden">Version</span>
             <select value=${viewed} onChange=${(event) => setRun(event.target.value)}>
-              ${trained.map((one) => html`<option value=${one.name}>${one.name}${one.psnr ? ` · ${one.psnr.toFixed(1)} dB` : ""}</option>`)}
+              ${trained.map((one, i) => html`<option value=${one.name}>${["Version " + (i + 1), one.name.endsWith("-part") && "a part", one.psnr && judged(one.psnr, one.held_out).toLowerCase()].filter(Boolean).join(" · ")}</option>`)}
             </select></label>`}
         </div>
         <div class=${`view on-${active}`} id="stage" role="tabpanel" aria-labelledby=${`tab-${active}`}>
-          ${active === "scene" && html`<${SceneView} key=${detail.live ? "live" : viewed} item=${item} run=${detail.live ? "" : viewed} live=${detail.live} />`}
+          ${active === "scene" && paged && html`<${ScenePage} key=${viewed} item=${item} run=${viewed} page=${page} act=${act} />`}
+          ${(active === "edit" || (active === "scene" && !paged)) && html`<${SceneView} key=${detail.live ? "live" : viewed} item=${item} run=${detail.live ? "" : viewed} live=${detail.live} />`}
           ${active === "compare" && html`<${Compare} key=${viewed} detail=${detail} run=${viewed} act=${act} />`}
           ${active === "cameras" && html`<${Cameras} model=${model} />`}
           ${active === "photographs" && html`<${Photographs} detail=${detail} states=${states} advice=${advice} choose=${choose} act=${act} marked=${capturing} />`}
@@ -145,6 +149,21 @@ export function Project({ item, say, choose, go }) {
       </aside>
     </main>`;
 }
+
+// The page to share, made at the first look.
+function ScenePage({ item, run, page, act }) {
+  const asked = useRef(false);
+  useEffect(() => {
+    if (page?.bytes || asked.current || ["queued", "running"].includes(page?.state)) return;
+    asked.current = true;
+    act(() => api("POST", `${of(item)}/shares`, { kind: "page", run }));
+  }, [page?.bytes, page?.state]);
+  if (!page?.bytes) return html`<${Wait} words="Opening the scene" />`;
+  const query = new URLSearchParams({ show: "", v: page.bytes });
+  return html`<iframe title="The scene in 3-D" src=${`/api/${of(item)}/shares/${encodeURIComponent(page.name)}?${query}`} allow="fullscreen"></iframe>`;
+}
+
+const Wait = ({ words }) => html`<div class="wait"><span class="spinner" aria-hidden="true"></span><p role="status">${words}</p></div>`;
 
 // The viewer of `lumigraph view`, or of a training under way, in a frame.
 function SceneView({ item, run, live }) {
@@ -172,6 +191,6 @@ function SceneView({ item, run, live }) {
     return () => (ended = true);
   }, [item, run]);
   if (fault) return html`<p class="fault pad" role="alert">${fault}</p>`;
-  if (!url) return html`<div class="wait"><span class="spinner" aria-hidden="true"></span><p role="status">${live ? "Preparing the training" : "Opening the scene"}</p></div>`;
+  if (!url) return html`<${Wait} words=${live ? "Preparing the training" : "Opening the scene"} />`;
   return html`<iframe title="The scene in 3-D" src=${url} allow="fullscreen"></iframe>`;
 }

@@ -10,19 +10,23 @@ import { Sorter } from "./sorter.js";
 export const ROW = 1024; // Gaussians in a row of each texture
 const BLUR = 0.3; // square pixels by which a footprint is widened
 const WHOLE = "const vec2 CORNERS[3] = vec2[](vec2(-1), vec2(3, -1), vec2(-1, 3)); void main() { gl_Position = vec4(CORNERS[gl_VertexID], 0, 1); }";
-const COPY = `precision highp float; uniform sampler2D drawn; uniform vec2 size, whole; out vec4 picture;
-void main() {
-  picture = size == whole ? texelFetch(drawn, ivec2(gl_FragCoord.xy), 0)
-    : texture(drawn, min(gl_FragCoord.xy * size / whole, size - 0.5) / whole);
-}`;
+const COPY = "precision highp float; uniform sampler2D drawn; out vec4 picture; void main() { picture = texelFetch(drawn, ivec2(gl_FragCoord.xy), 0); }";
 const [CLOUD, HARMONICS, MOTION, ORDER, SHAPES, LOOKS, DRAWN] = [0, 1, 2, 3, 4, 5, 6]; // units of textures
 
 export class Cloud {
   // capacity: Gaussians at most;  placed: Matrix4 from the cloud's frame to the scene's, a similarity
   constructor(stage, { capacity, degree, antialiased, placed = new Matrix4(), moves = null }) {
-    const gl = stage.renderer.getContext();
-    const rows = Math.ceil(capacity / ROW);
-    Object.assign(this, { stage, gl, degree, antialiased, placed, moves, ranges: [], time: 0, count: 0, made: {}, sizes: {} });
+    const gl = stage.renderer.getContext(), rows = Math.ceil(capacity / ROW);
+    Object.assign(this, { stage, gl, rows, degree, antialiased, placed, moves, ranges: [], time: 0 });
+    this.sorter = new Sorter(rows * ROW, ROW);
+    if (moves) this.sorter.hold({ moves: moves.spans });
+    this.begin();
+  }
+
+  // Programs and empty textures: at first, and again once a lost context is back.
+  begin() {
+    const { gl, rows, degree, moves, stage } = this;
+    Object.assign(this, { count: 0, order: null, made: {}, sizes: {}, heights: 1 });
     this.deep = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
     this.programs = [[WHOLE, projection], [vertex, fragment], [WHOLE, COPY]].map(([v, f]) => program(gl, v, f));
     this.texture(CLOUD, gl.RGBA32UI, 2 * ROW, rows);
@@ -30,11 +34,7 @@ export class Cloud {
     this.texture(MOTION, gl.RGBA32UI, ROW, moves ? rows : 1);
     this.frames = [0, 0].map(() => gl.createFramebuffer());
     this.corners = rectangles(gl);
-    this.sorter = new Sorter(rows * ROW, ROW);
-    if (moves) {
-      this.fill(MOTION, 0, moves.texels, ROW);
-      this.sorter.hold({ moves: moves.spans });
-    }
+    if (moves) this.fill(MOTION, 0, moves.texels, ROW);
     stage.renderer.resetState();
   }
 
@@ -46,8 +46,7 @@ export class Cloud {
       gl.deleteTexture(this.made[unit] ?? null);
       gl.bindTexture(gl.TEXTURE_2D, (this.made[unit] = gl.createTexture()));
       gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-      const filter = format === gl.RGBA16F ? gl.LINEAR : gl.NEAREST;
-      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
       this.sizes[unit] = size;
     } else gl.bindTexture(gl.TEXTURE_2D, this.made[unit]);
     return this.made[unit];
@@ -103,19 +102,23 @@ export class Cloud {
     this.stage.renderer.resetState();
   }
 
-  // scale: of the picture's sides, for a rough one
-  paint(scale) {
+  paint() {
     const { gl, stage } = this, { camera, renderer } = stage;
     if (!this.count) return;
-    const whole = renderer.getDrawingBufferSize(new Vector2());
-    const size = this.deep ? whole.clone().multiplyScalar(scale).ceil() : whole;
+    const size = renderer.getDrawingBufferSize(new Vector2());
     camera.updateMatrixWorld();
     renderer.resetState();
     plain(gl);
     gl.bindVertexArray(this.corners);
     this.project(size);
-    this.splat(size, whole);
+    this.splat(size);
     renderer.resetState();
+  }
+
+  // Waits until everything is drawn.
+  finish() {
+    const { gl } = this;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   project(size) {
@@ -140,13 +143,13 @@ export class Cloud {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  splat(size, whole) {
+  splat(size) {
     const { gl, deep } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (deep) {
-      this.onto(1, [DRAWN], gl.RGBA16F, whole.x, whole.y);
+      this.onto(1, [DRAWN], gl.RGBA16F, size.x, size.y);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
     }
@@ -156,10 +159,7 @@ export class Cloud {
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * ROW, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / ROW));
     if (!deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, whole.x, whole.y);
-    const copied = this.use(2, { drawn: DRAWN });
-    gl.uniform2f(copied.size, size.x, size.y);
-    gl.uniform2f(copied.whole, whole.x, whole.y);
+    this.use(2, { drawn: DRAWN });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

@@ -15,11 +15,19 @@ export async function levels(stage, settings, budget) {
   const meta = await (await loaded(base)).json();
   const scene = new Levels(stage, base, meta, budget);
   const coarsest = scene.files.filter(({ level }) => level === scene.coarsest);
-  const first = await fromSog(stage, new URL(coarsest[0].name, base));
+  const first = await scene.unpacked(coarsest[0]);
   const placed = new Matrix4().fromArray(settings.placed).transpose();
   scene.begin(new Cloud(stage, { capacity: scene.capacity, degree: first.degree, antialiased: first.antialiased, placed }));
   scene.put(coarsest[0], first);
-  for (const file of coarsest.slice(1)) scene.put(file, await fromSog(stage, new URL(file.name, base)));
+  const fill = async (files) => {
+    for (const file of files) scene.put(file, await scene.unpacked(file));
+  };
+  await fill(coarsest.slice(1));
+  stage.revive = async () => {
+    scene.begin(scene.cloud);
+    scene.cloud.begin();
+    await fill(coarsest);
+  };
   return { cloud: scene.cloud, select: (share) => scene.select(share) };
 }
 
@@ -51,9 +59,15 @@ class Levels {
     Object.assign(this, { stage, base, budget, leaves, files, used, capacity, coarsest, free: 0, loading: 0, clock: 0 });
   }
 
+  // With nothing loaded.
   begin(cloud) {
-    this.cloud = cloud;
+    for (const file of this.files) Object.assign(file, { at: null, asked: false });
+    Object.assign(this, { cloud, free: 0, era: {} });
     this.toLocal = cloud.placed.clone().invert();
+  }
+
+  unpacked(file) {
+    return fromSog(this.stage, new URL(file.name, this.base));
   }
 
   put(file, made, at = this.room(file)) {
@@ -92,10 +106,10 @@ class Levels {
 
   // A level for each leaf: refined in the order of pixels between neighbours until the budget is spent.
   wanted(budget) {
-    const { camera, renderer } = this.stage;
+    const { camera, height } = this.stage;
     const eye = camera.position.clone().applyMatrix4(this.toLocal);
     const forward = camera.getWorldDirection(new Vector3()).transformDirection(this.toLocal);
-    const pixels = (renderer.domElement.height / 2) * camera.projectionMatrix.elements[5];
+    const pixels = (height / 2) * camera.projectionMatrix.elements[5];
     const levels = new Map(), steps = [];
     for (const leaf of this.leaves) {
       const near = eye.clone().clamp(leaf.low, leaf.high), away = near.distanceTo(eye);
@@ -123,16 +137,20 @@ class Levels {
     const next = files.find((file) => file.at === null && !file.asked);
     const at = next ? this.room(next) : null;
     if (at === null) return;
+    const { era } = this;
     next.asked = true;
     this.loading++;
     try {
-      this.put(next, await fromSog(this.stage, new URL(next.name, this.base)), at);
+      const made = await this.unpacked(next);
+      if (era !== this.era) return; // the graphics card was lost meanwhile, and the room with it
+      this.put(next, made, at);
       next.asked = false;
     } catch (fault) {
       console.warn(fault.message); // and a coarser level stays
+    } finally {
+      this.loading--;
+      this.stage.redraw();
     }
-    this.loading--;
-    this.stage.redraw();
   }
 }
 

@@ -3,6 +3,7 @@
 const MOMENT = 33; // milliseconds that a picture may take while the camera moves
 const PAUSE = 150; // milliseconds without change after which the camera counts as resting
 const LEAST = 1 / 32; // of the work of a whole picture
+const FIRST = 1 / 16; // of it that the first picture takes, before anything is known of the device
 const ROUGHEST = 0.25; // of its pixels; below that fewer Gaussians are drawn
 const PHONE = 1e6, DESK = 3e6; // Gaussians within a budget of "auto"
 
@@ -11,19 +12,21 @@ export function budgetOf(settings) {
   return settings.budget ?? (phone ? PHONE : DESK);
 }
 
+const powerOfTwo = (share) => 2 ** Math.ceil(Math.log2(Math.min(1, share)));
+
 export class Pace {
   // rest: called when the camera has come to rest after pictures that were not whole
   constructor(rest) {
-    Object.assign(this, { rest, work: 1, moving: false, drawn: 0 });
+    Object.assign(this, { rest, work: FIRST, moving: true, drawn: 0 });
   }
 
-  // Square root of the share of pixels, and share of Gaussians in powers of two, that are to be drawn.
-  get scale() {
-    return this.moving ? Math.sqrt(Math.max(this.work, ROUGHEST)) : 1;
+  // Square root of the share of pixels, and share of Gaussians, that are to be drawn; both in powers of two, for each change costs.
+  get density() {
+    return this.moving ? Math.sqrt(Math.max(powerOfTwo(this.work), ROUGHEST)) : 1;
   }
 
   get share() {
-    return this.moving ? 2 ** Math.ceil(Math.log2(Math.min(1, this.work / ROUGHEST))) : 1;
+    return this.moving ? powerOfTwo(this.work / ROUGHEST) : 1;
   }
 
   // From a picture's milliseconds to the work that a moment allows.
