@@ -27,7 +27,7 @@ Sources = dict[str, str]  # module names, and the text of each
 RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
 READING_EDITION = "lumigraph.reading"  # counted by `test_reading_edition.py`, and not with the package
 # Of the package: who lowers a number lowers its ceiling.
-MAX_LINES = 120_148  # of Python
+MAX_LINES = 120_598  # of Python
 MAX_LONG_FUNCTIONS = 18  # of more than 60 lines; two have gsplat's signatures
 MAX_ANY_METHODS = 42  # parameters `method: Any`
 MAX_ROOMS = 39  # names at the top level; one is what gsplat calls its own
