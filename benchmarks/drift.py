@@ -10,7 +10,6 @@ Written for each size of the error: ATE, the sentence, and ATE and loops after t
 from __future__ import annotations
 
 import argparse
-from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -68,7 +67,7 @@ def main() -> None:
         for image, pose in zip(images, poses, strict=True):
             tracker.trajectory.know(image, pose, image)
             tracker.add_keyframe(tracker.frame(data, image))
-        said = drifted(SimpleNamespace(tracker=tracker), data) or "nothing is said"
+        said = drifted(tracker, data) or "nothing is said"
         tracker.is_keyframe.fill_(False)
         for k, image in enumerate(images):
             if k:

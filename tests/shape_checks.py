@@ -112,9 +112,9 @@ def defaults(function: Any) -> dict[str, Any]:
     return own | (function.__kwdefaults__ or {})
 
 
-def compare(function: Any, values: dict[str, Any], names: Any, annotations: dict[str, Any], axes: Any) -> None:
-    for name in names:
-        if name in values and not agrees(values[name], annotations[name]):
+def compare(function: Any, values: dict[str, Any], annotations: dict[str, Any], axes: Any) -> None:
+    for name, annotation in annotations.items():
+        if name in values and not agrees(values[name], annotation):
             value = values[name]
             is_ = f"{value.dtype} {tuple(value.shape)}" if hasattr(value, "shape") else repr(value)[:80]
             wanted = function.__annotations__[name]
@@ -150,9 +150,9 @@ def first_calls(function: Any = None, *, typechecker: Any = None) -> Any:
         values = given(function, args, words)
         axes = push_shape_memo(defaults(function) | values)
         try:
-            compare(function, values, annotations.keys() - {"return"}, annotations, axes)
+            compare(function, values, annotations, axes)
             result = function(*args, **words)
-            compare(function, {"return": result}, annotations.keys() & {"return"}, annotations, axes)
+            compare(function, {"return": result}, annotations, axes)
             return result
         finally:
             pop_shape_memo()

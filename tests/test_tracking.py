@@ -363,7 +363,7 @@ def test_a_drift_is_said_without_true_poses(metres):
         tracker.trajectory.know(frame.index, pose, frame.index)
         tracker.add_keyframe(frame)
     scene.names, tracker.sequence = [f"f{i}" for i in range(30)], lambda data: list(range(30))  # type: ignore[method-assign]
-    said = drifted(SimpleNamespace(tracker=tracker), scene)
+    said = drifted(tracker, scene)
     assert said.startswith("The path has drifted") == bool(said) == (metres > 0.1)
 
 

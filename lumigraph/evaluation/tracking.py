@@ -16,6 +16,7 @@ from jaxtyping import Float
 from .. import files
 from ..components.tracking.frames import MIN_COMMON, order_of
 from ..components.tracking.loops import DRIFTED, drift, motion
+from ..components.tracking.tracker import Tracker
 from ..components.tracking.trajectory import KNOWN, LOSSES, UNKNOWN
 from ..datasets.scene import Scene
 from ..errors import LumigraphWarning
@@ -158,11 +159,9 @@ def inaccurate(found: Tracked, names: Sequence[str]) -> str:
 
 
 @torch.no_grad()
-def drifted(method: Any, scene: Scene) -> str:
-    """Sentence for keyframes whose depth contradicts that of earlier ones where the path returns; empty if it does not.
-    It needs no true poses."""
-    tracker, names = method.tracker, scene.names
-    poses = tracker.trajectory.poses
+def drifted(tracker: Tracker, scene: Scene) -> str:
+    """Sentence, without true poses, on keyframes whose depth contradicts that of earlier ones; empty if few do."""
+    names, poses = scene.names, tracker.trajectory.poses
     chosen = evenly([i for i in tracker.sequence(scene) if tracker.is_keyframe[i]], RETURNED_KEYFRAMES)
     keyframes, found = [tracker.load_keyframe(scene, i) for i in chosen], []
     for k, frame in enumerate(keyframes):
@@ -172,10 +171,10 @@ def drifted(method: Any, scene: Scene) -> str:
             found.append((drift(frame, older, poses), names[frame.index], names[older.index]))
     if len(found) < MIN_RETURNS or (middle := sorted(found)[len(found) // 2][0]) < DRIFTED:
         return ""
-    worst, frame, older = max(found)
+    worst, seen_again, before = max(found)
     return (
         f"The path has drifted: where it returns, {100 * middle:.0f} % of a keyframe's points (median) are where an "
-        f"earlier one saw nothing, and {100 * worst:.0f} % of {frame} beside {older}; {REMEDY}"
+        f"earlier one saw nothing, and {100 * worst:.0f} % of {seen_again} beside {before}; {REMEDY}"
     )
 
 
@@ -221,7 +220,8 @@ def write_tracking(
     followed = Followed.of(method, scene)
     about: dict[str, Any] = {"frames": len(scene), "known": len(found.images)} | figures
     about |= {"share": len(found.images) / len(scene), "lost": [scene.names[i] for i in found.lost]}
-    fault = drifted(method, scene) if found.truth is None else inaccurate(found, scene.names)
+    tracker: Any = method.tracker
+    fault = drifted(tracker, scene) if found.truth is None else inaccurate(found, scene.names)
     about["warnings"] = [sentence for sentence in (followed.sentence, fault) if sentence]
     for sentence in about["warnings"]:
         warnings.warn(sentence, LumigraphWarning, stacklevel=2)
