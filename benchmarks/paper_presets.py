@@ -107,7 +107,7 @@ def main(options: Options) -> None:
         if options.again or name not in old:
             old[name] = apart(name, options)
             kept = [old[each] for each in methods.available() if each in old]
-            write_json(options.output, about() | {"cells": kept})
+            write_json(options.output, about() | {"cells": kept}, ours=True)
             console().print(name, old[name].get("fault") or f"{old[name]['steps']} steps, loss {old[name]['loss']}")
 
 
