@@ -112,7 +112,7 @@ def files_of(modules: Iterable[str]) -> list[str]:
 
 
 def survives(session: Any, module: str, text: str, seconds: int) -> bool:
-    """Whether all tests of a module pass with another text in its place, in a process that ends after seconds."""
+    """True if all tests of a module pass with another text in its place, in a process that ends after seconds."""
     child = multiprocessing.get_context("fork").Process(target=judge, args=(session, module, text))
     child.start()
     child.join(seconds)

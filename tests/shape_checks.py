@@ -53,27 +53,29 @@ def module_name(path: Path) -> str:
 
 
 class Names(dict[str, Any]):
-    """What annotations may name: a module's names and Python's; Any for others, as those imported for mypy alone."""
+    """A module's names and Python's, for its annotations; Any for others, as those imported for mypy alone."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, Any)
 
 
-def shaped(annotation: Any) -> bool:
-    return re.search(r"""\[[\w. ]+, ?['"]""", str(annotation)) is not None
+def shaped(annotation: Any, names: dict[str, Any]) -> bool:
+    """True for an annotation that states a shape, by itself or by a module's name for one, as `Pictures`."""
+    texts = [str(annotation), *(str(names.get(name)) for name in re.findall(r"\b[A-Z]\w*", str(annotation)))]
+    return any(re.search(r"""\[[\w. ]+, ?['"]""", text) for text in texts)
 
 
 def stated(function: Any) -> dict[str, Any]:
     """The annotations of a function that state shapes, by parameter, and of what it returns by "return"."""
     names, found = Names(function.__globals__), {}
     for name, annotation in function.__annotations__.items():
-        if shaped(annotation):
+        if shaped(annotation, function.__globals__):
             found[name] = eval(annotation, {}, names) if isinstance(annotation, str) else annotation
     return found
 
 
 def agrees(value: Any, annotation: Any) -> bool:
-    """Whether a value has the shapes that an annotation states, those within containers and unions too."""
+    """True for a value with the shapes that an annotation states, those within containers and unions too."""
     kind, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if kind in (typing.Union, types.UnionType):
         return any(agrees(value, one) for one in inner)
@@ -102,7 +104,7 @@ def agrees_alone(value: Any, annotation: Any) -> bool:
 
 
 def given(function: Any, args: tuple[Any, ...], words: dict[str, Any]) -> dict[str, Any]:
-    """What a call hands to a function's parameters, those of `*args` left out."""
+    """Values of a function's parameters in a call, but for those of `*args` and those left out."""
     return dict(zip(function.__code__.co_varnames[: function.__code__.co_argcount], args, strict=False)) | words
 
 
@@ -133,7 +135,9 @@ def first_calls(function: Any = None, *, typechecker: Any = None) -> Any:
         if is_dataclass(function) and "__init__" in vars(function):
             function.__init__ = first_calls(function.__init__)  # type: ignore[misc]
         return function
-    if not inspect.isfunction(function) or not any(map(shaped, function.__annotations__.values())):
+    if not inspect.isfunction(function):
+        return function
+    if not any(shaped(annotation, function.__globals__) for annotation in function.__annotations__.values()):
         return function
     annotations: dict[str, Any] | None = None
     last, calls = -1, 0

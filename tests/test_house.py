@@ -465,6 +465,20 @@ def test_first_calls_of_each_test_have_their_shapes_checked():
         Pairs(torch.zeros(4, 3), torch.zeros(2, 3))
 
 
+Rows = Float[torch.Tensor, "row 3"]
+
+
+@jaxtyping.jaxtyped(typechecker=None)
+def tripled(x: Rows | None) -> Rows:
+    return 3 * x
+
+
+def test_a_name_for_a_shape_is_checked():
+    assert tripled(torch.ones(2, 3)).shape == (2, 3)
+    with pytest.raises(shape_checks.ShapeError, match=r"x is torch.float32 \(3, 2\), not Rows"):
+        tripled(torch.ones(3, 2))
+
+
 @pytest.mark.parametrize(
     ("annotation", "right", "wrong"),
     [
